@@ -1,0 +1,191 @@
+"""The posed body: joints, forward kinematics, linear blend skinning.
+
+A body goes through three stages. `Body` is what a file holds (template and bases), `ShapedBody` has its shape
+coefficients applied, `PosedBody` stands in a pose. SMPL and Anny both end in `PosedBody`, so nothing above knows which
+one it was.
+"""
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from twofold.errors import TwofoldError
+from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigid_transform
+
+JOINT_NAMES = (
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
+    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
+    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
+)  # fmt: skip
+PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
+"""SMPL's tree; a parent always comes before its children, and the root's parent is -1."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A statistical body in SMPL's T-pose: y up, facing +z, its left hand at +x, arms level.
+
+    Attributes:
+        name: "smpl", "anny" or a name of the user's.
+        template: mean vertices, metres.
+        faces: triangles, counter-clockwise from outside.
+        weights: skinning weights, rows sum to 1.
+        joints: mean joints, metres.
+        shape_basis: change of the vertices per unit of each shape coefficient, metres.
+        joint_basis: the same for the joints.
+        pose_basis: SMPL's pose blend shapes, metres per element of (R_j - I), or no columns where a body has none.
+    """
+
+    name: str
+    template: Float[Tensor, "V 3"]
+    faces: Int[Tensor, "F 3"]
+    weights: Float[Tensor, "V 24"]
+    joints: Float[Tensor, "24 3"]
+    shape_basis: Float[Tensor, "V 3 S"]
+    joint_basis: Float[Tensor, "24 3 S"]
+    pose_basis: Float[Tensor, "V 3 P"]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Every array by its name, as a capture or a run stores it; `from_arrays` reads it back."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
+        return {"name": np.array(self.name), **{key: value.cpu().numpy() for key, value in tensors.items()}}
+
+    @staticmethod
+    def from_arrays(arrays: "dict[str, np.ndarray]", where: str = "the body's arrays") -> "Body":
+        """A body from the arrays that `arrays` gave.
+
+        Raises:
+            TwofoldError: an array is missing, has a wrong shape, or holds a number that is not finite.
+        """
+        names = [f.name for f in fields(Body)]
+        missing = [name for name in names if name not in arrays]
+        if missing:
+            raise TwofoldError(f"{where} lacks {', '.join(missing)}; expected {', '.join(names)}.")
+        numbers = {name: np.asarray(arrays[name]) for name in names if name != "name"}
+        v, f = numbers["template"].shape[0], numbers["faces"].shape[0]
+        s, p = numbers["shape_basis"].shape[-1], numbers["pose_basis"].shape[-1]
+        expected = {
+            "template": (v, 3), "faces": (f, 3), "weights": (v, 24), "joints": (24, 3),
+            "shape_basis": (v, 3, s), "joint_basis": (24, 3, s), "pose_basis": (v, 3, p),
+        }  # fmt: skip
+        for name, shape in expected.items():
+            if numbers[name].shape != shape:
+                raise TwofoldError(f"{name} in {where} should have the shape {shape}, it has {numbers[name].shape}.")
+            if not np.isfinite(numbers[name]).all():
+                raise TwofoldError(f"{name} in {where} holds a number that is not finite; make the body again.")
+        if p not in (0, 207):
+            raise TwofoldError(f"pose_basis in {where} should have 207 columns or none, it has {p}.")
+        if numbers["faces"].min() < 0 or numbers["faces"].max() >= v:
+            raise TwofoldError(f"faces in {where} name vertices outside 0..{v - 1}; the file is damaged.")
+        tensors = {n: torch.as_tensor(a.astype(np.float32)) for n, a in numbers.items() if n != "faces"}
+        return Body(name=str(arrays["name"]), faces=torch.as_tensor(numbers["faces"].astype(np.int64)), **tensors)
+
+
+@dataclass(frozen=True)
+class ShapedBody:
+    """One person's body in the T-pose; see `Body` for the fields."""
+
+    vertices: Float[Tensor, "V 3"]
+    joints: Float[Tensor, "24 3"]
+    faces: Int[Tensor, "F 3"]
+    weights: Float[Tensor, "V 24"]
+    pose_basis: Float[Tensor, "V 3 P"]
+
+
+@dataclass(frozen=True)
+class PosedBody:
+    """A body in one pose, beside itself in the canonical pose.
+
+    Attributes:
+        vertices: posed, world, metres.
+        canonical_vertices: in the canonical pose (T-pose, legs apart), metres.
+        faces: triangles.
+        weights: skinning weights.
+        bones: transforms from canonical to posed space, one a joint (B_i of Eq. 1).
+        joints: posed joints, world, metres.
+        pose: the axis-angle rotations that made it, root first, radians.
+    """
+
+    vertices: Float[Tensor, "V 3"]
+    canonical_vertices: Float[Tensor, "V 3"]
+    faces: Int[Tensor, "F 3"]
+    weights: Float[Tensor, "V 24"]
+    bones: Float[Tensor, "24 4 4"]
+    joints: Float[Tensor, "24 3"]
+    pose: Float[Tensor, "24 3"]
+
+
+def canonical_pose(dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Float[Tensor, "24 3"]:
+    """The pose of canonical space: all zero but the hips, turned by 30 degrees so that the legs stand apart."""
+    pose = torch.zeros(24, 3, dtype=dtype, device=device)
+    pose[1, 2], pose[2, 2] = math.pi / 6, -math.pi / 6
+    return pose
+
+
+def shape_body(body: Body, betas: Float[Tensor, "n"]) -> ShapedBody:
+    """Template plus shape coefficients (as many as given, at most the body's own number)."""
+    n = betas.shape[0]
+    return ShapedBody(
+        vertices=body.template + body.shape_basis[..., :n] @ betas,
+        joints=body.joints + body.joint_basis[..., :n] @ betas,
+        faces=body.faces,
+        weights=body.weights,
+        pose_basis=body.pose_basis,
+    )
+
+
+def joint_transforms(
+    joints: Float[Tensor, "24 3"], pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"]
+) -> Float[Tensor, "24 4 4"]:
+    """Where each joint's frame goes from the T-pose to the world: forward kinematics down SMPL's tree.
+
+    The root turns about its own rest joint and `translation` is added afterwards, SMPL's own convention. The result acts
+    on points of the T-pose (it is already relative to the rest joints).
+    """
+    rotations = axis_angle_to_matrix(pose)
+    chain: list[Tensor] = []
+    for j, parent in enumerate(PARENTS):
+        offset = joints[j] + translation if parent < 0 else joints[j] - joints[parent]
+        local = rigid_transform(rotations[j], offset)
+        chain.append(local if parent < 0 else chain[parent] @ local)
+    world = torch.stack(chain)
+    moved = (world[:, :3, :3] @ joints[:, :, None])[..., 0]
+    return rigid_transform(world[:, :3, :3], world[:, :3, 3] - moved)
+
+
+def blend_shapes(shaped: ShapedBody, pose: Float[Tensor, "24 3"]) -> Float[Tensor, "V 3"]:
+    """T-pose vertices with the pose blend shapes of `pose` added (SMPL; nothing is added for a body without)."""
+    if shaped.pose_basis.shape[-1] == 0:
+        return shaped.vertices
+    rotations = axis_angle_to_matrix(pose[1:])
+    identity = torch.eye(3, dtype=pose.dtype, device=pose.device)
+    return shaped.vertices + shaped.pose_basis @ (rotations - identity).flatten()
+
+
+def skin(
+    points: Float[Tensor, "n 3"], weights: Float[Tensor, "n J"], transforms: Float[Tensor, "J 4 4"]
+) -> Float[Tensor, "n 3"]:
+    """Linear blend skinning: each point moved by the weighted mean of the transforms."""
+    blended = (weights @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4))
+    return (blended[:, :, :3] @ points[:, :, None])[..., 0] + blended[:, :, 3]
+
+
+def pose_body(shaped: ShapedBody, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"]) -> PosedBody:
+    """The body in a pose, its canonical twin, and the bone transforms between the two."""
+    rest_pose = canonical_pose(pose.dtype, pose.device)
+    to_canonical = joint_transforms(shaped.joints, rest_pose, torch.zeros_like(translation))
+    to_world = joint_transforms(shaped.joints, pose, translation)
+    posed_joints = (to_world[:, :3, :3] @ shaped.joints[:, :, None])[..., 0] + to_world[:, :3, 3]
+    return PosedBody(
+        vertices=skin(blend_shapes(shaped, pose), shaped.weights, to_world),
+        canonical_vertices=skin(blend_shapes(shaped, rest_pose), shaped.weights, to_canonical),
+        faces=shaped.faces,
+        weights=shaped.weights,
+        bones=to_world @ rigid_inverse(to_canonical),
+        joints=posed_joints,
+        pose=pose,
+    )

@@ -1,0 +1,81 @@
+"""What a data set is to everything above it: a `Capture` of `Frame`s."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from twofold.body.skeleton import Body
+from twofold.geometry.cameras import Camera
+
+SPLITS = ("train", "novel_view", "novel_pose")
+"""Training pictures; the same moments from other cameras; other moments."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture: a camera at a moment. Pictures are read when asked for, so a long capture costs no memory.
+
+    Attributes:
+        time: index of the moment into the capture's motion.
+        camera_name: which camera.
+        camera: that camera.
+        pose: axis-angle rotations, root first, radians, relative to SMPL's T-pose.
+        translation: SMPL's own (the root turns about its rest joint, then this is added), metres.
+        image_file: PNG or JPEG, 8-bit sRGB.
+        mask_file: one channel, 0 outside .. 255 on the person.
+    """
+
+    time: int
+    camera_name: str
+    camera: Camera
+    pose: Float[Tensor, "24 3"]
+    translation: Float[Tensor, "3"]
+    image_file: Path
+    mask_file: Path
+
+    def image(self) -> Float[Tensor, "h w 3"]:
+        """Colours in 0..1, as stored (background included)."""
+        with Image.open(self.image_file) as picture:
+            return torch.from_numpy(np.array(picture.convert("RGB"), dtype=np.float32) / 255)
+
+    def mask(self) -> Float[Tensor, "h w"]:
+        """Share of each pixel that the person covers, 0..1."""
+        with Image.open(self.mask_file) as picture:
+            return torch.from_numpy(np.array(picture.convert("L"), dtype=np.float32) / 255)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A person filmed: body, cameras, motion, pictures, splits.
+
+    Attributes:
+        name: for titles.
+        folder: where it lies.
+        body: the body model as arrays.
+        betas: its shape coefficients for this person.
+        fps: moments per second.
+        background: the colour behind the person where a picture is composited, 0..1.
+        splits: frames of "train", "novel_view" and "novel_pose" (the last two may be empty).
+        meshes: true posed surfaces by time (npz with vertices in metres and faces), where they are known.
+        credit: whom to name when showing it; empty for one's own.
+    """
+
+    name: str
+    folder: Path
+    body: Body
+    betas: Float[Tensor, "S"]
+    fps: float
+    background: tuple[float, float, float]
+    splits: dict[str, tuple[Frame, ...]]
+    meshes: dict[int, Path] = field(default_factory=dict)
+    credit: str = ""
+
+    @property
+    def train(self) -> tuple[Frame, ...]:
+        """The training frames."""
+        return self.splits["train"]
