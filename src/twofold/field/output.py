@@ -1,0 +1,23 @@
+"""What a field answers at a point."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class FieldOutput:
+    """Signed distance and colour at points of canonical space.
+
+    Attributes:
+        sdf: metres, negative inside.
+        color: 0..1 for a field that has learned; not clamped.
+        gradient: of the signed distance by the canonical point; None where nobody asked for it.
+        base: the pose-independent branch alone, where there is one beside the whole.
+    """
+
+    sdf: Float[Tensor, "S"]
+    color: Float[Tensor, "S 3"]
+    gradient: Float[Tensor, "S 3"] | None
+    base: "FieldOutput | None" = None

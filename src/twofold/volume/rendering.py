@@ -1,0 +1,72 @@
+"""From signed distances to pixels: density, packed samples, compositing."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from twofold.geometry.cameras import Rays
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of many rays in one flat list, grouped by ray and ordered by depth; a ray may have none.
+
+    Attributes:
+        ray_index: the ray each sample lies on, ascending.
+        depth: where on that ray, metres.
+        delta: length of ray that the sample stands for, metres.
+    """
+
+    ray_index: Int[Tensor, "S"]
+    depth: Float[Tensor, "S"]
+    delta: Float[Tensor, "S"]
+
+    def points(self, rays: Rays) -> Float[Tensor, "S 3"]:
+        """Positions in the world."""
+        origins, directions = rays.origins[self.ray_index], rays.directions[self.ray_index]
+        return origins + self.depth[:, None] * directions
+
+    def __getitem__(self, index: Tensor) -> "Samples":
+        return Samples(self.ray_index[index], self.depth[index], self.delta[index])
+
+    def __len__(self) -> int:
+        return len(self.depth)
+
+
+def laplace_density(sdf: Float[Tensor, "*b"], beta: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
+    """Volume density of a signed distance (Eq. 7): the Laplace distribution's CDF of -sdf, over its scale.
+
+    Args:
+        sdf: metres, negative inside.
+        beta: scale of the distribution, metres, positive.
+
+    Returns:
+        density per metre, between 0 far outside and 1 / beta deep inside.
+    """
+    tail = 0.5 * torch.exp(-sdf.abs() / beta)
+    return torch.where(sdf > 0, tail, 1 - tail) / beta
+
+
+def composite_weights(
+    density: Float[Tensor, "S"], samples: Samples
+) -> Float[Tensor, "S"]:
+    """What each sample adds to its ray, T_i (1 - exp(-sigma_i delta_i)); a ray's weights sum to at most one."""
+    optical = density * samples.delta
+    # One running sum over all rays would lose digits in float32; what a ray starts with is taken off again.
+    total = torch.cumsum(optical.double(), 0)
+    before = total - optical
+    first = torch.ones_like(samples.ray_index, dtype=torch.bool)
+    first[1:] = samples.ray_index[1:] != samples.ray_index[:-1]
+    start = torch.cummax(torch.where(first, torch.arange(len(samples), device=first.device), 0), 0).values
+    depth = (before - before[start]).to(optical.dtype)
+    return torch.exp(-depth) * -torch.expm1(-optical)
+
+
+def composite(
+    weights: Float[Tensor, "S"], values: Float[Tensor, "S C"], samples: Samples, rays: int
+) -> Float[Tensor, "rays C"]:
+    """Sum of weighted values along each ray (Eq. 8); a ray without samples gets zero."""
+    out = torch.zeros(rays, values.shape[-1], dtype=values.dtype, device=values.device)
+    return out.index_add(0, samples.ray_index, weights[:, None] * values)
