@@ -1,0 +1,73 @@
+# `make help` lists the targets. Each sets up .venv by itself; the second call finds it ready.
+
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= demo
+PYTEST_ARGS ?=
+SOURCES := src tests docs/hooks $(wildcard benchmarks)
+
+# Large tensors come and go at every step. Without these, glibc hands their pages back to the kernel each time; other
+# C libraries ignore the variable.
+export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1:glibc.malloc.mmap_threshold=1073741824:glibc.malloc.trim_threshold=4294967296
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-all checks pytest docs format benchmarks clean
+
+help: ## This list
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
+
+demo: $(VENV)/.ready-studio ## Make a person, train an avatar, show it: demo/report.html (a few minutes)
+	$(BIN)/twofold demo --out $(OUT)
+
+test: checks pytest docs ## Everything that has to hold before a change lands
+
+test-all: checks ## The same, with the tests that take minutes
+	$(BIN)/python -m pytest -m "" $(PYTEST_ARGS)
+	$(MAKE) docs
+
+checks: $(VENV)/.ready-all ## Style, spelling, floors, types
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/codespell
+	$(BIN)/lint-imports
+	$(BIN)/pyright
+
+pytest: $(VENV)/.ready-all ## The tests alone (PYTEST_ARGS="tests/field -x" to choose)
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+docs: $(VENV)/.ready-all ## Build the documentation into site/, strictly
+	$(BIN)/mkdocs build --strict --quiet
+
+format: $(VENV)/.ready-all ## Repair what ruff can repair
+	$(BIN)/ruff check --fix $(SOURCES)
+	$(BIN)/ruff format $(SOURCES)
+
+benchmarks: $(VENV)/.ready-studio ## Measure speed, beside the reference form
+	$(BIN)/python -m benchmarks
+
+clean: ## Remove what the targets made, .venv included
+	rm -rf $(VENV) site dist build .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find src tests docs -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/.ready-studio: pyproject.toml constraints.txt | $(VENV)/.made
+	@echo "Setting up $(VENV): downloads some 500 MB, once."
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio]'
+	@touch $@
+
+$(VENV)/.ready-all: pyproject.toml constraints.txt | $(VENV)/.made
+	@echo "Setting up $(VENV) with all tools: downloads some 600 MB, once."
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio,test,docs,dev]'
+	@touch $@ $(VENV)/.ready-studio
+
+$(VENV)/.made:
+	@python=; for name in python3.11 python3.12 python3.10 python3 python; do \
+		if "$$name" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))' 2>/dev/null; \
+		then python=$$name; break; fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+		echo "twofold needs Python 3.10, 3.11 or 3.12 on the PATH, and found none; install one and try again." >&2; exit 2; \
+	fi; \
+	"$$python" -m venv --clear $(VENV) || { \
+		echo "$$python could not make $(VENV); on Debian and Ubuntu install its venv package first." >&2; exit 2; }
+	@touch $@
