@@ -1,0 +1,285 @@
+"""Files that are either whole or not there, and one plain sentence when the disk says no.
+
+Everything is built under a name of its own beside the target and renamed at the end, so that a reader never meets half a
+file and a killed program leaves the old one as it was.
+"""
+
+import contextlib
+import errno
+import json
+import os
+import secrets
+import shutil
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twofold.errors import TwofoldError
+
+_ADVICE = {
+    errno.EACCES: "there is no permission; choose another place or change its permissions",
+    errno.EPERM: "it is not allowed; choose another place or change its permissions",
+    errno.EROFS: "the disk is read-only; choose another place",
+    errno.ENOSPC: "the disk is full; free some space or choose another disk",
+    errno.EDQUOT: "the disk quota is used up; free some space or choose another disk",
+    errno.EFBIG: "the file grew past the allowed size; raise the limit or choose another disk",
+    errno.EIO: "the disk reports a failure; check it or choose another",
+    errno.EISDIR: "a folder stands there, expected a file; choose another name",
+    errno.ENOTDIR: "a part of this path is a file, expected a folder; choose another name",
+    errno.EEXIST: "a file stands there, expected a folder; choose another name",
+    errno.ENOENT: "the folder it should lie in does not exist; make that first or correct the path",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+}
+
+
+_ONLY_WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+
+
+@contextlib.contextmanager
+def plain_errors(path: Path | str, *own: Path) -> Iterator[None]:
+    """Turns what the system says while `path` is written into one sentence that names it.
+
+    Args:
+        path: as the user gave it.
+        own: `path` and the temporary names it is built under. Errors about other files are passed on as they are, so
+            that an unreadable input is not taken for an unwritable output.
+
+    Raises:
+        TwofoldError: no permission, no space, a file where a folder should be, and the like.
+    """
+    try:
+        yield
+    except OSError as error:
+        ours = error.errno in _ONLY_WRITING or error.filename is None
+        if not ours:
+            about = Path(os.fsdecode(error.filename)).absolute()
+            roots = [p.absolute() for p in own or (Path(path),)]
+            ours = any(about == p or p in about.parents or about in p.parents for p in roots)
+        if not ours or error.errno not in _ADVICE:
+            raise
+        raise TwofoldError(f"Cannot write {path}: {_ADVICE[error.errno]}.") from error
+
+
+@contextlib.contextmanager
+def write_atomically(path: Path | str) -> Iterator[Path]:
+    """A temporary path beside `path` (same ending) to write to; it takes the name of `path` when the block ends well.
+
+    What lay at `path` stays until then, and stays if the block fails. The data are on the disk before the rename.
+
+    Raises:
+        TwofoldError: see `plain_errors`.
+    """
+    path = Path(path)
+    prefix = f".{path.stem}.partial-"
+    temporary = path.with_name(f"{prefix}{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+    with plain_errors(path, path, temporary):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        _remove_orphans(path.parent, prefix, path.suffix)
+        try:
+            yield temporary
+            _flush_to_disk(temporary)
+            os.replace(temporary, path)
+            _flush_to_disk(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def new_folder(path: Path | str, replace: bool = False) -> Iterator[Path]:
+    """A temporary folder beside `path` to fill; it takes the name of `path` when the block ends well, else it goes.
+
+    Missing folders above are made. Single files in it are not flushed one by one: there may be thousands.
+
+    Args:
+        path: must not exist or be an empty folder, unless `replace`.
+        replace: an existing folder gives way, but only once the new one is complete.
+
+    Raises:
+        TwofoldError: something is there already; or see `plain_errors`.
+    """
+    target = Path(path).resolve()
+    prefix = f"{target.name}.partial-"
+    temporary = target.with_name(f"{prefix}{os.getpid()}-{secrets.token_hex(4)}")
+    made: list[Path] = []
+    with plain_errors(path, target, temporary):
+        if target.exists() and not target.is_dir():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target))
+        if target.is_dir() and any(target.iterdir()) and not replace:
+            raise TwofoldError(f"The folder {path} already holds files; choose another name or empty it first.")
+        try:
+            made += _make_parents(target)
+            _remove_orphans(target.parent, prefix)
+            temporary.mkdir()
+            yield temporary
+            _put_in_place(temporary, target)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            for folder in reversed(made):
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
+            raise
+
+
+def write_bytes(path: Path | str, data: bytes) -> None:
+    """Writes `data` as the whole file.
+
+    Raises:
+        TwofoldError: see `plain_errors`.
+    """
+    with write_atomically(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_json(path: Path | str, value: object) -> None:
+    """Writes lists, dictionaries, numbers and strings to be read by people too: one line for each row of numbers.
+
+    Raises:
+        TwofoldError: see `plain_errors`.
+        ValueError: a number is not finite, which JSON cannot hold.
+    """
+    write_bytes(path, (json_text(value) + "\n").encode())
+
+
+def json_text(value: object, indent: int = 0) -> str:
+    """JSON with lists of plain values on one line.
+
+    >>> print(json_text({"rows": [[1, 2], [3, 4]], "name": "cam"}))
+    {
+      "rows": [
+        [1, 2],
+        [3, 4]
+      ],
+      "name": "cam"
+    }
+    """
+    inner, outer = " " * (indent + 2), " " * indent
+    if isinstance(value, dict) and value:
+        items = [f"{inner}{json.dumps(str(k))}: {json_text(v, indent + 2)}" for k, v in value.items()]
+        return "{\n" + ",\n".join(items) + f"\n{outer}}}"
+    if isinstance(value, list | tuple) and any(isinstance(v, list | tuple | dict) for v in value):
+        return "[\n" + ",\n".join(inner + json_text(v, indent + 2) for v in value) + f"\n{outer}]"
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def write_npz(path: Path | str, arrays: dict[str, np.ndarray]) -> None:
+    """Writes named arrays of numbers or text; the same arrays give the same bytes.
+
+    Raises:
+        TwofoldError: see `plain_errors`.
+    """
+    objects = [name for name, array in arrays.items() if array.dtype.hasobject]
+    if objects:
+        raise TypeError(f"Only plain arrays are written, these hold Python objects: {', '.join(objects)}.")
+    with write_atomically(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_json(path: Path | str) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        TwofoldError: it is missing, unreadable or not JSON (the line is named).
+    """
+    path = Path(path)
+    try:
+        return json.loads(path.read_bytes().decode())
+    except json.JSONDecodeError as error:
+        raise TwofoldError(
+            f"{path} is not valid JSON at line {error.lineno} ({error.msg}); correct it there."
+        ) from error
+    except UnicodeDecodeError as error:
+        raise TwofoldError(f"{path} is not text in UTF-8; save it as such.") from error
+    except OSError as error:
+        raise TwofoldError(f"{path} {_why_unreadable(error)}.") from error
+
+
+def read_npz(path: Path | str) -> dict[str, np.ndarray]:
+    """The arrays of an npz file; nothing in it is ever run.
+
+    Raises:
+        TwofoldError: it is missing, unreadable, damaged, or holds Python objects instead of numbers.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            arrays = np.load(file, allow_pickle=False)
+            if isinstance(arrays, np.ndarray):
+                raise TwofoldError(f"{path} holds a single array, expected several named ones (np.savez).")
+            return {name: arrays[name] for name in arrays.files}
+    except OSError as error:
+        raise TwofoldError(f"{path} {_why_unreadable(error)}.") from error
+    except (ValueError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError) as error:
+        pickled = "pickle" in str(error)
+        what = "holds Python objects, expected plain arrays" if pickled else "is damaged or no npz file"
+        raise TwofoldError(f"{path} {what}; make it again.") from error
+
+
+def _why_unreadable(error: OSError) -> str:
+    """The end of a sentence that begins with the file's name."""
+    if isinstance(error, FileNotFoundError):
+        return "is missing"
+    if isinstance(error, IsADirectoryError):
+        return "is a folder, expected a file"
+    if isinstance(error, PermissionError):
+        return "may not be read; change its permissions"
+    return f"cannot be read ({error.strerror or error})"
+
+
+def _flush_to_disk(path: Path) -> None:
+    if path.is_dir() and os.name == "nt":  # Windows opens no folders
+        return
+    handle = os.open(path, os.O_RDWR if path.is_file() else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _remove_orphans(folder: Path, prefix: str, suffix: str = "") -> None:
+    """Removes what killed programs left half-written in `folder`; what running ones write stays."""
+    if os.name == "nt":  # where asking whether a process lives would end it
+        return
+    for name in os.listdir(folder):
+        process = name[len(prefix) :].partition("-")[0]
+        if name.startswith(prefix) and name.endswith(suffix) and process.isdigit() and not _is_running(int(process)):
+            orphan = folder / name
+            if orphan.is_dir():
+                shutil.rmtree(orphan, ignore_errors=True)
+            else:
+                orphan.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def _make_parents(path: Path) -> list[Path]:
+    """Makes the folders above `path`; returns those that were missing, outermost first."""
+    missing = [folder for folder in path.parents if not folder.exists()][::-1]
+    for folder in missing:
+        folder.mkdir()
+    return missing
+
+
+def _put_in_place(temporary: Path, target: Path) -> None:
+    if not target.exists():
+        os.replace(temporary, target)
+        return
+    old = target.with_name(f"{target.name}.replaced-{secrets.token_hex(4)}")
+    os.replace(target, old)
+    try:
+        os.replace(temporary, target)
+    except BaseException:
+        os.replace(old, target)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
