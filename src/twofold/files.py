@@ -1,7 +1,7 @@
 """Files that are either whole or not there, and one plain sentence when the disk says no.
 
-Everything is built under a name of its own beside the target and renamed at the end, so that a reader never meets half a
-file and a killed program leaves the old one as it was.
+Everything is built under a name of its own beside the target and renamed at the end, so that a reader never meets
+half a file and a killed program leaves the old one as it was.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ import os
 import secrets
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ _ONLY_WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 
 
 @contextlib.contextmanager
-def plain_errors(path: Path | str, *own: Path) -> Iterator[None]:
+def plain_errors(path: Path | str, *own: Path) -> Generator[None, None, None]:
     """Turns what the system says while `path` is written into one sentence that names it.
 
     Args:
@@ -54,17 +54,17 @@ def plain_errors(path: Path | str, *own: Path) -> Iterator[None]:
         yield
     except OSError as error:
         ours = error.errno in _ONLY_WRITING or error.filename is None
-        if not ours:
+        if error.filename is not None:
             about = Path(os.fsdecode(error.filename)).absolute()
             roots = [p.absolute() for p in own or (Path(path),)]
-            ours = any(about == p or p in about.parents or about in p.parents for p in roots)
+            ours = ours or any(about == p or p in about.parents or about in p.parents for p in roots)
         if not ours or error.errno not in _ADVICE:
             raise
         raise TwofoldError(f"Cannot write {path}: {_ADVICE[error.errno]}.") from error
 
 
 @contextlib.contextmanager
-def write_atomically(path: Path | str) -> Iterator[Path]:
+def write_atomically(path: Path | str) -> Generator[Path, None, None]:
     """A temporary path beside `path` (same ending) to write to; it takes the name of `path` when the block ends well.
 
     What lay at `path` stays until then, and stays if the block fails. The data are on the disk before the rename.
@@ -89,7 +89,7 @@ def write_atomically(path: Path | str) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def new_folder(path: Path | str, replace: bool = False) -> Iterator[Path]:
+def new_folder(path: Path | str, replace: bool = False) -> Generator[Path, None, None]:
     """A temporary folder beside `path` to fill; it takes the name of `path` when the block ends well, else it goes.
 
     Missing folders above are made. Single files in it are not flushed one by one: there may be thousands.
