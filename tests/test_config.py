@@ -132,6 +132,7 @@ def test_every_fault_names_its_path_and_what_is_allowed() -> None:
     refusal({"sampler": {"step": 1}}, "sampler", "lacks 'kind'", "Uniform or Shell")
     refusal({"sampler": None}, "sampler", "Uniform or Shell", "None")
     refusal({"extra": {"kind": "Shell"}}, "extra.kind", "step, radius")
+    refusal({"extra": {"step": True}}, "extra.step", "a number", "True")
     refusal({"extra": {"step": float("nan")}}, "extra.step", "nan")
     refusal({"seed": -1}, "seed must not be negative")
     with pytest.raises(TwofoldError, match=r"recipe\.json lacks data"):
@@ -166,7 +167,7 @@ def test_overrides_are_read_by_the_type_of_their_field() -> None:
         ("seed", "key=value"),
         ("=3", "key=value"),
         ("steed=3", "Did you mean seed?"),
-        ("branches=low", "Did you mean field.branches?"),
+        ("count=3", "Did you mean sampler.count?"),
         ("field.brnches=low", "Did you mean field.branches?"),
         ("field.branches=lows", "both, low or high"),
         ("field.branches=lows", "Did you mean low?"),
