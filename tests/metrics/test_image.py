@@ -101,6 +101,7 @@ def test_silhouette_overlap_by_counting() -> None:
     opacity[:6], mask[3:] = 0.8, 0.9
     assert silhouette_iou(opacity, mask) == pytest.approx(3 / 10)
     assert silhouette_iou(opacity, mask, threshold=0.85) == 0.0
+    assert silhouette_iou(mask, opacity, threshold=0.85) == 0.0
     assert silhouette_iou(mask, mask) == 1.0
     assert silhouette_iou(torch.zeros(3, 3), torch.zeros(3, 3)) == 1.0
 
