@@ -213,8 +213,8 @@ def read_npz(path: Path | str) -> dict[str, np.ndarray]:
     except OSError as error:
         raise TwofoldError(f"{path} {_why_unreadable(error)}.") from error
     except (ValueError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError) as error:
-        pickled = "pickle" in str(error)
-        what = "holds Python objects, expected plain arrays" if pickled else "is damaged or no npz file"
+        objects = "Object arrays" in str(error)
+        what = "holds Python objects, expected plain arrays" if objects else "is damaged or no npz file"
         raise TwofoldError(f"{path} {what}; make it again.") from error
 
 

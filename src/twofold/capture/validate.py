@@ -1,0 +1,248 @@
+"""Every fault of a capture folder, found in one go and said in one sentence each.
+
+The quick checks open no pixels; the thorough ones read every picture.
+"""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from twofold.body.skeleton import joint_transforms, shape_body
+from twofold.capture.contents import (
+    IMAGES,
+    MASKS,
+    MESHES,
+    MOTION,
+    Contents,
+    file_stem,
+    numbered_files,
+    read_contents,
+    spans,
+)
+from twofold.errors import TwofoldError
+from twofold.files import read_npz
+from twofold.geometry.cameras import Camera, project
+
+Item = TypeVar("Item")
+_IMAGE_MODES, _MASK_MODES = ("RGB", "RGBA", "L"), ("L", "1")
+_PERSON = 128
+"""Masks count as the person from here on, when a whole mask is judged."""
+
+
+def validate(folder: Path | str) -> list[str]:
+    """Everything that is wrong with a capture folder; an empty list if nothing is. Reads every picture.
+
+    Each fault is one sentence that says where (files as seen from `folder`), what, and what to do.
+    """
+    folder = Path(folder)
+    try:
+        contents, faults = read_contents(folder)
+    except TwofoldError as error:
+        return [str(error)]
+    return faults + quick_faults(contents) + pixel_faults(contents) + mesh_faults(folder)
+
+
+def require(faults: list[str], folder: Path | str, shown: int = 8) -> None:
+    """Raises one error that lists the first faults, if there are any.
+
+    Raises:
+        TwofoldError: one sentence for one fault; for several a line that says so and one for each of the first `shown`.
+    """
+    if not faults:
+        return
+    if len(faults) == 1:
+        raise TwofoldError(f"The capture {folder} cannot be used: {faults[0]}")
+    lines = [f"The capture {folder} cannot be used, it has {len(faults)} faults:"]
+    lines += [f"  - {fault}" for fault in faults[:shown]]
+    if len(faults) > shown:
+        lines.append(f"  and {len(faults) - shown} more.")
+    raise TwofoldError("\n".join(lines))
+
+
+def quick_faults(contents: Contents) -> list[str]:
+    """What files' names, picture headers and projected joints show: missing, wrong-sized, behind, outside."""
+    faults: list[str] = []
+    for camera_name, times in contents.pictures.items():
+        for kind, modes in ((IMAGES, _IMAGE_MODES), (MASKS, _MASK_MODES)):
+            there = contents.files(kind, camera_name)
+            missing = [time for time in times if time not in there]
+            if missing:
+                faults.append(
+                    f"{kind}/{camera_name} lacks the pictures of times {spans(missing)}; "
+                    f"add them ({file_stem(missing[0])}.png and so on) or take these times out of the splits."
+                )
+            if camera_name in contents.cameras:
+                paths = [there[time] for time in times if time in there]
+                faults += _header_faults(contents.folder, paths, contents.cameras[camera_name], modes)
+    return faults + _placement_faults(contents)
+
+
+def _header_faults(folder: Path, paths: list[Path], camera: Camera, modes: tuple[str, ...]) -> list[str]:
+    def check(path: Path) -> str:
+        where = path.relative_to(folder).as_posix()
+        try:
+            with Image.open(path) as picture:
+                (width, height), mode = picture.size, picture.mode
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            return f"{where} is no readable picture ({_reason(error)}); save it again as PNG."
+        if (height, width) != (camera.height, camera.width):
+            return f"{where} has {width} x {height} pixels, its camera {camera.width} x {camera.height}; resize one."
+        if mode not in modes:
+            what = "an 8-bit colour picture" if "RGB" in modes else "one 8-bit channel, 0 outside and 255 on the person"
+            return f"{where} should hold {what}; it is of the kind {mode}."
+        return ""
+
+    return _in_threads(check, paths)
+
+
+def joint_positions(contents: Contents) -> Float[Tensor, "T 24 3"] | None:
+    """Where the joints stand at every moment, world, metres; None where body or motion could not be read."""
+    body, betas, poses, translations = contents.body, contents.betas, contents.poses, contents.translations
+    if body is None or betas is None or poses is None or translations is None:
+        return None
+    joints = shape_body(body, betas).joints
+    transforms = torch.vmap(joint_transforms, in_dims=(None, 0, 0))(joints, poses, translations)
+    return (transforms[..., :3, :3] @ joints[:, :, None])[..., 0] + transforms[..., :3, 3]
+
+
+def _placement_faults(contents: Contents) -> list[str]:
+    """Cameras that have the body behind them or beside their picture."""
+    joints = joint_positions(contents)
+    if joints is None:
+        return []
+    faults: list[str] = []
+    for name, times in contents.pictures.items():
+        camera = contents.cameras.get(name)
+        shown = [time for time in times if time < len(joints)]
+        if camera is None or not shown:
+            continue
+        pixels, depths = project(camera, joints[shown])
+        behind = (depths <= 0).any(-1)
+        outside = ~behind & ~_in_picture(pixels, camera).any(-1)
+        if behind.any():
+            faults.append(
+                f"Camera {name} has the body behind it at times {spans(_where(shown, behind))}; check world_to_camera "
+                f"(not its inverse; x right, y down, z forward) and the translations in {MOTION} (metres)."
+            )
+        if outside.any():
+            faults.append(
+                f"The body is outside the picture of camera {name} at times {spans(_where(shown, outside))}; "
+                f"check its intrinsics (pixels) and the translations in {MOTION} (metres)."
+            )
+    return faults
+
+
+def pixel_faults(contents: Contents) -> list[str]:
+    """What only the pixels show: damaged pictures, empty or full masks, masks that the body is nowhere near."""
+    joints = joint_positions(contents)
+    faults: list[str] = []
+    for name, times in contents.pictures.items():
+        images, masks = contents.files(IMAGES, name), contents.files(MASKS, name)
+        visible, size = dict[int, np.ndarray](), (0, 0)
+        if name in contents.cameras:
+            camera = contents.cameras[name]
+            size = (camera.height, camera.width)
+            visible = {} if joints is None else _visible_joints(joints, camera)
+        faults += _in_threads(partial(_decoding_fault, contents.folder), [images[t] for t in times if t in images])
+        with_joints = [(masks[t], visible.get(t)) for t in times if t in masks]
+        faults += _in_threads(partial(_mask_fault, contents.folder, size), with_joints)
+    return faults
+
+
+def _visible_joints(joints: Float[Tensor, "T 24 3"], camera: Camera) -> dict[int, np.ndarray]:
+    """Pixels (column, row) of the joints inside the picture, by time."""
+    pixels, depths = project(camera, joints)
+    inside = _in_picture(pixels, camera) & (depths > 0)
+    return {time: pixels[time][inside[time]].numpy() for time in range(len(joints))}
+
+
+def _decoding_fault(folder: Path, path: Path) -> str:
+    try:
+        with Image.open(path) as picture:
+            picture.load()
+    except UnidentifiedImageError:
+        return ""  # a quick check names it
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        return f"{path.relative_to(folder).as_posix()} is damaged ({_reason(error)}); save it again."
+    return ""
+
+
+def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, np.ndarray | None]) -> str:
+    """What is wrong with one mask.
+
+    Args:
+        folder: the capture's.
+        size: height and width that it should have.
+        item: its file, and the visible joints in pixels (column, row), None where they are not known.
+    """
+    path, joints = item
+    damaged = _decoding_fault(folder, path)
+    if damaged:
+        return damaged
+    where = path.relative_to(folder).as_posix()
+    try:
+        with Image.open(path) as picture:
+            mask = np.array(picture.convert("L"))
+    except UnidentifiedImageError:
+        return ""
+    if mask.max() == 0:
+        return f"{where} is all black, so nobody is there; mend it or take this time out of the splits."
+    if mask.max() < _PERSON:
+        return f"{where} reaches only {mask.max()}; the person should be 255."
+    if mask.min() >= _PERSON:
+        return (
+            f"{where} is all white, as if the person filled the picture; mend it or take this time out of the splits."
+        )
+    columns, rows = np.flatnonzero((mask >= _PERSON).any(0)), np.flatnonzero((mask >= _PERSON).any(1))
+    if joints is not None and len(joints) and mask.shape == size:
+        low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]])
+        if not ((joints >= low) & (joints <= high)).all(-1).any():
+            return f"{where} and the posed body do not meet; check that mask, pose and camera are of the same moment."
+    return ""
+
+
+def mesh_faults(folder: Path) -> list[str]:
+    """What is wrong with the true surfaces, where there are any."""
+    faults: list[str] = []
+    for path in numbered_files(folder / MESHES, (".npz",)).values():
+        where = path.relative_to(folder).as_posix()
+        try:
+            arrays = read_npz(path)
+        except TwofoldError as error:
+            faults.append(str(error).replace(f"{folder}/", ""))
+            continue
+        vertices, faces = arrays.get("vertices"), arrays.get("faces")
+        if vertices is None or faces is None or vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+            faults.append(f"{where} should hold vertices (V x 3, metres) and faces (F x 3).")
+        elif not np.isfinite(vertices).all():
+            faults.append(f"{where}: vertices are not finite; make this mesh again.")
+        elif faces.dtype.kind not in "iu" or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+            faults.append(f"{where}: faces name vertices outside 0..{len(vertices) - 1}; make this mesh again.")
+    return faults
+
+
+def _in_picture(pixels: Float[Tensor, "*b 2"], camera: Camera) -> Tensor:
+    size = torch.tensor([camera.width, camera.height])
+    return ((pixels >= -0.5) & (pixels <= size - 0.5)).all(-1)
+
+
+def _where(times: list[int], chosen: Tensor) -> list[int]:
+    return [time for time, yes in zip(times, chosen.tolist(), strict=True) if yes]
+
+
+def _reason(error: BaseException) -> str:
+    return "unknown format" if isinstance(error, UnidentifiedImageError) else str(error).rstrip(".")
+
+
+def _in_threads(check: Callable[[Item], str], items: Iterable[Item]) -> list[str]:
+    """The faults that `check` finds, in the order of the items. Decoding pictures leaves Python's lock free."""
+    with ThreadPoolExecutor() as pool:
+        return [fault for fault in pool.map(check, items) if fault]

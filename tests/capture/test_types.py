@@ -1,0 +1,42 @@
+"""Frames read their pictures when asked."""
+
+import numpy as np
+import torch
+from PIL import Image
+
+from twofold.capture.folder import read_capture
+
+
+def test_a_frame_reads_colours_and_mask_as_shares_of_one(tiny):
+    frame = read_capture(tiny).train[2]
+    image, mask = frame.image(), frame.mask()
+    assert image.shape == (40, 48, 3)
+    assert mask.shape == (40, 48)
+    torch.testing.assert_close(image[mask == 1], torch.tensor([200, 100, 50]).expand(int(mask.sum()), 3) / 255)
+    torch.testing.assert_close(image[mask == 0], torch.full((int((mask == 0).sum()), 3), 32 / 255))
+
+
+def test_a_grey_picture_and_a_bilevel_mask_are_read_as_well(tiny):
+    frame = read_capture(tiny).train[0]
+    Image.fromarray(np.full((40, 48), 51, np.uint8)).save(frame.image_file)
+    with Image.open(frame.mask_file) as picture:
+        before = frame.mask()
+        bilevel = picture.convert("1")
+    bilevel.save(frame.mask_file)
+    assert frame.image().unique().tolist() == [torch.tensor(0.2).item()]
+    torch.testing.assert_close(frame.mask(), before)
+
+
+def test_pictures_are_read_anew_each_time(tiny):
+    """A long capture costs no memory: nothing is kept."""
+    frame = read_capture(tiny).train[0]
+    first = frame.image()
+    Image.fromarray(np.zeros((40, 48, 3), np.uint8)).save(frame.image_file)
+    assert first.max() > 0
+    assert frame.image().max() == 0
+
+
+def test_train_is_the_train_split(tiny):
+    capture = read_capture(tiny)
+    assert capture.train is capture.splits["train"]
+    assert [frame.time for frame in capture.train] == [0, 1, 2, 3]
