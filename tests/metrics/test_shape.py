@@ -1,0 +1,123 @@
+"""Surface figures against closed forms: parallel and tilted planes, spheres, a surface half missing."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from twofold.errors import TwofoldError
+from twofold.metrics.shape import (
+    PROTOCOLS,
+    chamfer_cm,
+    chamfer_vertices_cm2,
+    compare_surfaces,
+    normal_consistency_vertices,
+)
+
+Mesh = tuple[Tensor, Tensor]
+
+
+def plane(n: int = 12, height: float = 0.0, width: float = 1.0) -> Mesh:
+    """A square of side 1 m at z = height, facing +z; with `width` only that much of it, from x = 0."""
+    x, y = torch.meshgrid(torch.linspace(0, width, n), torch.linspace(0, 1, n), indexing="ij")
+    vertices = torch.stack([x, y, torch.full_like(x, height)], -1).reshape(-1, 3)
+    corner = torch.arange(n * n).reshape(n, n)
+    a, b, c, d = corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]
+    return vertices, torch.cat([torch.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+
+
+def sphere(radius: float, n: int = 60) -> Mesh:
+    """By latitude and longitude, facing outward."""
+    square, faces = plane(n)
+    polar, around = (0.001 + 0.998 * square[:, 0]) * math.pi, square[:, 1] * 2 * math.pi
+    directions = torch.stack([polar.sin() * around.cos(), polar.sin() * around.sin(), polar.cos()], -1)
+    return radius * directions, faces
+
+
+def test_parallel_planes_are_their_distance_apart() -> None:
+    figures = compare_surfaces(*plane(5), *plane(14, height=0.02), samples=500)
+    assert figures["chamfer_cm"] == pytest.approx(2.0, abs=1e-5)
+    assert figures["normal_consistency"] == pytest.approx(1.0, abs=1e-6)
+    assert figures["normal_consistency_vertices"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_one_surface_meshed_twice_is_at_distance_zero() -> None:
+    assert chamfer_cm(*plane(5), *plane(14), samples=500) == pytest.approx(0.0, abs=1e-4)
+
+
+def test_concentric_spheres_differ_by_their_radii() -> None:
+    figures = compare_surfaces(*sphere(0.31), *sphere(0.30), samples=2000)
+    assert figures["chamfer_cm"] == pytest.approx(1.0, abs=0.02)
+    assert figures["normal_consistency"] > 0.998
+    # Vertex lies over vertex: each is exactly 1 cm away, there and back.
+    assert figures["chamfer_vertices_cm2"] == pytest.approx(2.0, abs=1e-3)
+    assert figures["normal_consistency_vertices"] > 0.998
+
+
+def test_missing_half_counts_in_one_direction_only() -> None:
+    half, whole = plane(width=0.5), plane()
+    figures = compare_surfaces(*half, *whole, samples=4000)
+    assert figures["accuracy_cm"] == pytest.approx(0.0, abs=1e-4)
+    # Half of the whole square lies 0 to 50 cm away from the half: 25 cm on average, over all 12.5 cm.
+    assert figures["completeness_cm"] == pytest.approx(12.5, abs=0.5)
+    assert figures["chamfer_cm"] == pytest.approx(figures["completeness_cm"] / 2, abs=1e-4)
+    assert chamfer_cm(*half, *whole, samples=4000) == pytest.approx(figures["chamfer_cm"], abs=1e-9)
+    assert chamfer_cm(*whole, *half, samples=4000) == pytest.approx(figures["chamfer_cm"], abs=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.0])
+def test_tilted_plane_has_the_closed_form_normals(angle: float) -> None:
+    vertices, faces = plane()
+    c, s = math.cos(angle), math.sin(angle)
+    turned = vertices @ torch.tensor([[1.0, 0, 0], [0, c, -s], [0, s, c]]).T
+    figures = compare_surfaces(turned, faces, vertices, faces, samples=300)
+    assert figures["normal_consistency"] == pytest.approx(c, abs=1e-5)
+    assert figures["normal_consistency_vertices"] == pytest.approx(1 - 2 * math.sin(angle / 2), abs=1e-5)
+
+
+def test_only_the_signed_normals_notice_a_flipped_surface() -> None:
+    vertices, faces = plane()
+    figures = compare_surfaces(vertices, faces.flip(1), vertices, faces, samples=300)
+    assert figures["normal_consistency"] == pytest.approx(1.0, abs=1e-6)
+    assert figures["normal_consistency_vertices"] == pytest.approx(-1.0, abs=1e-6)
+
+
+def test_vertex_figures_equal_all_pairs_by_hand() -> None:
+    generator = torch.Generator().manual_seed(0)
+    (ours, our_faces), (theirs, their_faces) = sphere(0.3, 14), sphere(0.32, 11)
+    ours = ours + 0.02 * torch.randn(ours.shape, generator=generator)
+    pairs = torch.cdist(ours, theirs)
+    by_hand = 1e4 * (pairs.amin(0).square().mean() + pairs.amin(1).square().mean())
+    assert chamfer_vertices_cm2(ours, theirs) == pytest.approx(by_hand.item(), rel=1e-4)
+
+    def normals(vertices: Tensor, faces: Tensor) -> Tensor:
+        total = torch.zeros_like(vertices)
+        for face in faces:
+            a, b, c = vertices[face]
+            total[face] += torch.linalg.cross(b - a, c - a)
+        return total / total.norm(dim=-1, keepdim=True).clamp_min(1e-20)
+
+    difference = normals(theirs, their_faces) - normals(ours, our_faces)[pairs.argmin(0)]
+    expected = 1 - difference.norm(dim=-1).mean().item()
+    assert normal_consistency_vertices(ours, our_faces, theirs, their_faces) == pytest.approx(expected, abs=1e-5)
+
+
+def test_same_seed_same_figure_and_another_seed_nearly() -> None:
+    meshes = (*sphere(0.3), *plane())
+    first = chamfer_cm(*meshes, samples=1000, seed=1)
+    assert chamfer_cm(*meshes, samples=1000, seed=1) == first
+    assert chamfer_cm(*meshes, samples=1000, seed=2) != first
+    assert chamfer_cm(*meshes, samples=1000, seed=2) == pytest.approx(first, rel=0.1)
+
+
+def test_empty_or_broken_surface_is_one_clear_sentence() -> None:
+    vertices, faces = plane()
+    with pytest.raises(TwofoldError, match="second of the two surfaces to compare is empty"):
+        chamfer_cm(vertices, faces, vertices, faces[:0])
+    with pytest.raises(TwofoldError, match=r"first .* not finite"):
+        chamfer_cm(vertices * math.nan, faces, vertices, faces)
+
+
+def test_every_figure_has_its_protocol() -> None:
+    assert compare_surfaces(*plane(), *plane(), samples=10).keys() == PROTOCOLS.keys()
