@@ -103,6 +103,15 @@ def test_vertex_figures_equal_all_pairs_by_hand() -> None:
     assert normal_consistency_vertices(ours, our_faces, theirs, their_faces) == pytest.approx(expected, abs=1e-5)
 
 
+def test_normals_count_in_both_directions() -> None:
+    """A square beside the same square with a wall on it: only from the wall are the normals perpendicular."""
+    floor, faces = plane(height=0.0)
+    wall = floor[:, [0, 2, 1]] + torch.tensor([0.0, 0.5, 1e-4])
+    both = (torch.cat([floor, wall]), torch.cat([faces, faces + len(floor)]))
+    figures = compare_surfaces(floor, faces, *both, samples=4000)
+    assert figures["normal_consistency"] == pytest.approx((1 + 0.5) / 2, abs=0.02)
+
+
 def test_same_seed_same_figure_and_another_seed_nearly() -> None:
     meshes = (*sphere(0.3), *plane())
     first = chamfer_cm(*meshes, samples=1000, seed=1)
