@@ -14,6 +14,7 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -162,7 +163,7 @@ def _triangles(vertices: Float[np.ndarray, "n 3"], quads: Int[np.ndarray, "q 4"]
 
 
 def _merged_weights(
-    rig: dict[str, dict[str, str]], painted: dict[str, list[tuple[int, float]]], n: int
+    rig: dict[str, Any], painted: dict[str, list[tuple[int, float]]], n: int
 ) -> Float[np.ndarray, "n 24"]:
     weights = np.zeros((n, len(BONES)))
     for bone, entries in painted.items():
@@ -174,7 +175,7 @@ def _merged_weights(
     return weights / np.maximum(weights.sum(1, keepdims=True), 1e-12)
 
 
-def _joint_means(rig: dict[str, dict[str, dict]], groups: dict[str, list[list[int]]]) -> list[Int[np.ndarray, "k"]]:
+def _joint_means(rig: dict[str, Any], groups: dict[str, list[list[int]]]) -> list[Int[np.ndarray, "k"]]:
     """The vertices whose mean each joint is."""
     means: list[np.ndarray] = []
     for bone in BONES:
@@ -255,7 +256,7 @@ def _principal_components(
     """Mean and the first components, scaled to unit variance; rounded, so that every machine gets the same numbers."""
     mean = people.mean(0)
     rest = (people - mean).reshape(len(people), -1)
-    values, vectors = np.linalg.eigh(rest @ rest.T)
+    _, vectors = np.linalg.eigh(rest @ rest.T)
     directions = vectors[:, ::-1][:, :SHAPES].T @ rest / np.sqrt(len(people) - 1)
     # An eigenvector's sign is arbitrary: positive coefficients raise the head.
     head_height = directions[:, 3 * JOINT_NAMES.index("head") + 1]

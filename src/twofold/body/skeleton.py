@@ -24,6 +24,11 @@ JOINT_NAMES = (
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 """SMPL's tree; a parent always comes before its children, and the root's parent is -1."""
 
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    "template": ("V", 3), "faces": ("F", 3), "weights": ("V", 24), "joints": (24, 3),
+    "shape_basis": ("V", 3, "S"), "joint_basis": (24, 3, "S"), "pose_basis": ("V", 3, "P"),
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Body:
@@ -59,24 +64,27 @@ class Body:
         """A body from the arrays that `arrays` gave.
 
         Raises:
-            TwofoldError: an array is missing, has a wrong shape, or holds a number that is not finite.
+            TwofoldError: an array is missing, has a wrong shape, or holds something that is no finite number.
         """
         names = [f.name for f in fields(Body)]
         missing = [name for name in names if name not in arrays]
         if missing:
             raise TwofoldError(f"{where} lacks {', '.join(missing)}; expected {', '.join(names)}.")
         numbers = {name: np.asarray(arrays[name]) for name in names if name != "name"}
-        v, f = numbers["template"].shape[0], numbers["faces"].shape[0]
-        s, p = numbers["shape_basis"].shape[-1], numbers["pose_basis"].shape[-1]
-        expected = {
-            "template": (v, 3), "faces": (f, 3), "weights": (v, 24), "joints": (24, 3),
-            "shape_basis": (v, 3, s), "joint_basis": (24, 3, s), "pose_basis": (v, 3, p),
-        }  # fmt: skip
-        for name, shape in expected.items():
-            if numbers[name].shape != shape:
-                raise TwofoldError(f"{name} in {where} should have the shape {shape}, it has {numbers[name].shape}.")
-            if not np.isfinite(numbers[name]).all():
-                raise TwofoldError(f"{name} in {where} holds a number that is not finite; make the body again.")
+        sizes: dict[str, int] = {}
+        for name, shape in _SHAPES.items():
+            array = numbers[name]
+            for axis, size in zip(shape, array.shape, strict=False):
+                if isinstance(axis, str):
+                    sizes.setdefault(axis, size)
+            expected = tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in shape)
+            if array.shape != expected:
+                raise TwofoldError(f"{name} in {where} should have the shape {expected}, it has {array.shape}.")
+            if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+                raise TwofoldError(f"{name} in {where} holds something that is no finite number; make the body again.")
+        v, p = sizes["V"], sizes["P"]
+        if v == 0 or sizes["F"] == 0:
+            raise TwofoldError(f"{where} has no vertices or no faces; make the body again.")
         if p not in (0, 207):
             raise TwofoldError(f"pose_basis in {where} should have 207 columns or none, it has {p}.")
         if numbers["faces"].min() < 0 or numbers["faces"].max() >= v:
@@ -143,8 +151,8 @@ def joint_transforms(
 ) -> Float[Tensor, "24 4 4"]:
     """Where each joint's frame goes from the T-pose to the world: forward kinematics down SMPL's tree.
 
-    The root turns about its own rest joint and `translation` is added afterwards, SMPL's own convention. The result acts
-    on points of the T-pose (it is already relative to the rest joints).
+    The root turns about its own rest joint and `translation` is added afterwards, SMPL's own convention. The result
+    acts on points of the T-pose (it is already relative to the rest joints).
     """
     rotations = axis_angle_to_matrix(pose)
     chain: list[Tensor] = []

@@ -16,7 +16,8 @@ def axis_angle_to_matrix(axis_angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b
     angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
     # Taylor series near zero keep both the value and its derivative finite.
     first = torch.where(small, 1 - squared / 6, angle.sin() / angle)
-    second = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / angle.square())
+    # (1 - cos) / angle^2 without the cancellation that spoils its derivative in single precision.
+    second = torch.where(small, 0.5 - squared / 24, 2 * ((angle / 2).sin() / angle).square())
     cross = cross_matrix(axis_angle)
     identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
     return identity + first[..., None, None] * cross + second[..., None, None] * (cross @ cross)
@@ -31,18 +32,18 @@ def cross_matrix(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 def matrix_to_axis_angle(matrix: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """The logarithm of a rotation; angles in [0, pi]. Goes through the unit quaternion, stable at 0 and pi."""
-    m = matrix
-    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.flatten(-2).unbind(-1)
+    trace = m00 + m11 + m22
+    x, y, z = m21 - m12, m02 - m20, m10 - m01
+    xy, xz, yz = m01 + m10, m02 + m20, m12 + m21
     # Each row is the quaternion (w, x, y, z) scaled by its own largest entry; the best-conditioned row is taken.
-    candidates = torch.stack(
-        [
-            torch.stack([1 + trace, m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1),
-            torch.stack([m[..., 2, 1] - m[..., 1, 2], 1 + 2 * m[..., 0, 0] - trace, m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0]], -1),
-            torch.stack([m[..., 0, 2] - m[..., 2, 0], m[..., 0, 1] + m[..., 1, 0], 1 + 2 * m[..., 1, 1] - trace, m[..., 1, 2] + m[..., 2, 1]], -1),
-            torch.stack([m[..., 1, 0] - m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1], 1 + 2 * m[..., 2, 2] - trace], -1),
-        ],
-        -2,
-    )  # fmt: skip
+    rows = (
+        (1 + trace, x, y, z),
+        (x, 1 + 2 * m00 - trace, xy, xz),
+        (y, xy, 1 + 2 * m11 - trace, yz),
+        (z, xz, yz, 1 + 2 * m22 - trace),
+    )
+    candidates = torch.stack([torch.stack(row, -1) for row in rows], -2)
     best = candidates.diagonal(dim1=-2, dim2=-1).argmax(-1)
     quaternion = torch.take_along_dim(candidates, best[..., None, None], dim=-2).squeeze(-2)
     quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
