@@ -1,0 +1,140 @@
+import math
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from twofold.geometry.cameras import Rays
+from twofold.volume.rendering import Samples, composite, composite_weights, laplace_density
+
+
+def literal_density(s, beta):
+    """One over beta, times the Laplace distribution's CDF at -s."""
+    cdf = 0.5 * math.exp(-s / beta) if -s <= 0 else 1 - 0.5 * math.exp(s / beta)
+    return cdf / beta
+
+
+def packed(counts, seed=0, dtype=torch.float64):
+    """Samples of len(counts) rays, so many on each, and a density for each sample."""
+    generator = torch.Generator().manual_seed(seed)
+    index = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
+    total = len(index)
+    delta = 0.2 * torch.rand(total, generator=generator, dtype=dtype)
+    return Samples(index, delta.cumsum(0), delta), 8 * torch.rand(total, generator=generator, dtype=dtype)
+
+
+def literal_weights(density, samples):
+    """T_i (1 - exp(-sigma_i delta_i)) with T_i the product of what came before on that ray."""
+    weights = []
+    for i in range(len(samples)):
+        before = sum(
+            (density[j] * samples.delta[j]).item() for j in range(i) if samples.ray_index[j] == samples.ray_index[i]
+        )
+        weights.append(math.exp(-before) * (1 - math.exp(-(density[i] * samples.delta[i]).item())))
+    return torch.tensor(weights, dtype=density.dtype)
+
+
+COUNTS = st.lists(st.integers(0, 6), min_size=1, max_size=6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(s=st.floats(-3, 3), beta=st.floats(1e-3, 2))
+def test_density_is_the_scaled_laplace_distribution(s, beta):
+    found = laplace_density(torch.tensor(s, dtype=torch.float64), torch.tensor(beta, dtype=torch.float64))
+    torch.testing.assert_close(found.item(), literal_density(s, beta), rtol=1e-12, atol=1e-300)
+
+
+def test_density_falls_from_one_over_beta_to_zero():
+    beta = torch.tensor(0.05)
+    density = laplace_density(torch.linspace(-2, 2, 401), beta)
+    assert (density.diff() <= 0).all()
+    torch.testing.assert_close(density[[0, 200, -1]], torch.tensor([20.0, 10.0, 0.0]), atol=1e-6, rtol=1e-6)
+
+
+def test_density_has_finite_gradients_at_and_far_from_the_surface():
+    s = torch.tensor([-1e3, -1.0, 0.0, 1e-9, 1.0, 1e3], requires_grad=True)
+    beta = torch.tensor(1e-4, requires_grad=True)
+    laplace_density(s, beta).sum().backward()
+    assert s.grad.isfinite().all()
+    assert beta.grad.isfinite()
+
+
+def test_density_passes_gradcheck():
+    s = torch.tensor([-0.3, -0.05, 0.02, 0.4], dtype=torch.float64, requires_grad=True)
+    beta = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(laplace_density, (s, beta))
+
+
+@settings(max_examples=40, deadline=None)
+@given(counts=COUNTS, seed=st.integers(0, 1000))
+def test_weights_are_those_of_the_ray_by_ray_loop(counts, seed):
+    samples, density = packed(counts, seed)
+    torch.testing.assert_close(composite_weights(density, samples), literal_weights(density, samples))
+
+
+@settings(max_examples=40, deadline=None)
+@given(counts=COUNTS, seed=st.integers(0, 1000))
+def test_weights_of_a_ray_sum_to_its_opacity_and_never_past_one(counts, seed):
+    samples, density = packed(counts, seed)
+    weights = composite_weights(density, samples)
+    opacity = composite(weights, torch.ones(len(samples), 1, dtype=torch.float64), samples, len(counts))[:, 0]
+    assert (weights >= 0).all()
+    assert (opacity <= 1 + 1e-12).all()
+    for ray in range(len(counts)):
+        on = samples.ray_index == ray
+        exact = 1 - math.exp(-(density[on] * samples.delta[on]).sum().item())
+        torch.testing.assert_close(opacity[ray].item(), exact)
+
+
+def test_composite_adds_up_each_ray_and_leaves_the_empty_ones_zero():
+    samples, density = packed([2, 0, 3], seed=1)
+    weights = composite_weights(density, samples)
+    colors = torch.rand(5, 3, dtype=torch.float64)
+    image = composite(weights, colors, samples, 4)
+    expected = torch.stack(
+        [
+            weights[0] * colors[0] + weights[1] * colors[1],
+            torch.zeros(3, dtype=torch.float64),
+            weights[2] * colors[2] + weights[3] * colors[3] + weights[4] * colors[4],
+            torch.zeros(3, dtype=torch.float64),
+        ]
+    )
+    torch.testing.assert_close(image, expected)
+
+
+def test_samples_of_other_rays_do_not_matter():
+    samples, density = packed([3, 4], seed=2)
+    alone = composite_weights(density[3:], samples[torch.arange(3, 7)])
+    torch.testing.assert_close(composite_weights(density, samples)[3:], alone)
+
+
+def test_many_opaque_rays_keep_single_precision():
+    samples, density = packed([50] * 2000, dtype=torch.float32)
+    weights = composite_weights(1000 * density, samples)
+    exact = composite_weights(
+        1000 * density.double(), Samples(samples.ray_index, samples.depth, samples.delta.double())
+    )
+    torch.testing.assert_close(weights, exact.float(), rtol=1e-5, atol=1e-6)
+
+
+def test_compositing_passes_gradcheck():
+    samples, density = packed([2, 0, 3])
+
+    def image(density, delta, colors):
+        moved = Samples(samples.ray_index, samples.depth, delta)
+        return composite(composite_weights(density, moved), colors, moved, 3)
+
+    colors = torch.rand(5, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(image, (density.requires_grad_(), samples.delta.requires_grad_(), colors))
+
+
+def test_points_lie_on_their_rays():
+    rays = Rays(torch.tensor([[0.0, 0, 0], [1, 0, 0]]), torch.tensor([[0.0, 0, 1], [0, 1, 0]]), *torch.zeros(2, 2))
+    samples = Samples(torch.tensor([0, 1, 1]), torch.tensor([2.0, 3.0, 4.0]), torch.ones(3))
+    assert samples.points(rays).tolist() == [[0, 0, 2], [1, 3, 0], [1, 4, 0]]
+    assert len(samples[torch.tensor([0, 2])]) == 2
+
+
+def test_no_samples_render_nothing():
+    samples, density = packed([0, 0])
+    assert composite(composite_weights(density, samples), torch.zeros(0, 3, dtype=torch.float64), samples, 2).sum() == 0
