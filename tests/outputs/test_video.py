@@ -59,6 +59,8 @@ def test_added_column_repeats_the_last(tmp_path: Path) -> None:
 def test_codec_without_x264_still_gives_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(av, "codecs_available", av.codecs_available - {"libx264"})
     write_video(tmp_path / "v.mp4", flat_frames(64, 48), fps=25)
+    with av.open(str(tmp_path / "v.mp4")) as file:
+        assert file.streams.video[0].codec_context.name == "mpeg4"
     for frame, color in zip(read_back(tmp_path / "v.mp4"), COLORS, strict=True):
         assert np.abs(frame.astype(int) - color).max() <= 8
 

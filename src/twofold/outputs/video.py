@@ -43,7 +43,6 @@ def write_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 3"]], 
                 stream.pix_fmt = "yuv420p"
                 stream.options = {"crf": QUALITY} if x264 else {"qscale": "3"}
                 stream.codec_context.colorspace = matrix
-                stream.codec_context.color_range = ColorRange.MPEG
             if picture.shape[:2] != size:
                 raise ValueError(f"a frame of the video is {picture.shape[:2]}, the first was {size}")
             padded = np.pad(picture, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
