@@ -5,6 +5,7 @@ coefficients applied, `PosedBody` stands in a pose. SMPL and Anny both end in `P
 one it was.
 """
 
+import itertools
 import math
 from dataclasses import dataclass, fields
 
@@ -23,6 +24,9 @@ JOINT_NAMES = (
 )  # fmt: skip
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 """SMPL's tree; a parent always comes before its children, and the root's parent is -1."""
+
+_GENERATIONS = (1, 4, 7, 10, 15, 18, 20, 22, 24)
+"""Joints equally far from the root stand together in SMPL's order; here each such group begins (and the last ends)."""
 
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "template": ("V", 3), "faces": ("F", 3), "weights": ("V", 24), "joints": (24, 3),
@@ -154,12 +158,13 @@ def joint_transforms(
     The root turns about its own rest joint and `translation` is added afterwards, SMPL's own convention. The result
     acts on points of the T-pose (it is already relative to the rest joints).
     """
-    rotations = axis_angle_to_matrix(pose)
-    chain: list[Tensor] = []
-    for j, parent in enumerate(PARENTS):
-        offset = joints[j] + translation if parent < 0 else joints[j] - joints[parent]
-        local = rigid_transform(rotations[j], offset)
-        chain.append(local if parent < 0 else chain[parent] @ local)
+    rest = joints.unbind()
+    above = torch.stack([-translation, *(rest[parent] for parent in PARENTS[1:])])
+    local = rigid_transform(axis_angle_to_matrix(pose), joints - above)
+    chain = list(local[:1])
+    for first, end in itertools.pairwise(_GENERATIONS):
+        parents = torch.stack([chain[parent] for parent in PARENTS[first:end]])
+        chain += (parents @ local[first:end]).unbind()
     world = torch.stack(chain)
     moved = (world[:, :3, :3] @ joints[:, :, None])[..., 0]
     return rigid_transform(world[:, :3, :3], world[:, :3, 3] - moved)

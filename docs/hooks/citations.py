@@ -1,0 +1,86 @@
+"""What the source says about itself, for the documentation: its equations and its modules.
+
+MkDocs calls `on_page_markdown` for each page. `<!-- equations -->` becomes a table of the paper's equations and the
+functions that hold them, `<!-- modules -->` the reference of every module. `tests/test_house.py` uses the same reader.
+"""
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+SOURCE = Path(__file__).resolve().parents[2] / "src"
+CITATION = re.compile(r"\(Eqs?\. (\d+(?:, \d+)*)\)")
+EQUATIONS = {
+    1: "inverse skinning: an observed point goes home to canonical space",
+    2: "Fourier encoding of a point, low octaves",
+    3: "pose-independent branch: signed distance, colour and features",
+    4: "Fourier encoding of the same point, more octaves",
+    5: "pose-dependent branch: what the pose adds to both",
+    6: "the sum of the two branches",
+    7: "signed distance to volume density",
+    8: "samples along a ray to a pixel",
+    9: "reconstruction loss",
+    10: "eikonal loss",
+    11: "common loss: the first branch alone explains the picture",
+    12: "all losses, weighted",
+}
+
+
+@dataclass(frozen=True)
+class Citation:
+    """An equation number in the docstring of `name`, such as "twofold.volume.rendering.composite"."""
+
+    number: int
+    name: str
+    file: Path
+
+
+def modules(source: Path = SOURCE) -> dict[str, Path]:
+    """Every module under `source` that is not private, by its dotted name."""
+    found = {}
+    for file in sorted(source.rglob("*.py")):
+        parts = file.relative_to(source).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        if not any(part.startswith("_") for part in name.split(".")):
+            found[name] = file
+    return found
+
+
+def functions(tree: ast.AST, prefix: str) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
+    """Functions and methods with their dotted names, those inside of classes included, those inside of functions not."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield f"{prefix}.{node.name}", node
+        elif isinstance(node, ast.ClassDef):
+            yield from functions(node, f"{prefix}.{node.name}")
+
+
+def citations(source: Path = SOURCE) -> list[Citation]:
+    """Equation numbers in the docstrings of functions, in the order of the numbers."""
+    found = []
+    for module, file in modules(source).items():
+        for name, node in functions(ast.parse(file.read_text("utf-8")), module):
+            for match in CITATION.finditer(ast.get_docstring(node) or ""):
+                found += [Citation(int(number), name, file) for number in match[1].split(", ")]
+    return sorted(found, key=lambda citation: citation.number)
+
+
+def equation_table(source: Path = SOURCE) -> str:
+    """Markdown: number, meaning, and a link to the function."""
+    rows = ["| Eq. | What it says | Function |", "|---|---|---|"]
+    for cited in citations(source):
+        short = cited.name.removeprefix("twofold.")
+        rows.append(f"| {cited.number} | {EQUATIONS[cited.number]} | [`{short}`][{cited.name}] |")
+    return "\n".join(rows)
+
+
+def module_reference(source: Path = SOURCE) -> str:
+    """Markdown: what mkdocstrings needs to show each module; an empty package is left out."""
+    return "\n\n".join(f"::: {name}" for name, file in modules(source).items() if "__init__" not in file.name)
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """MkDocs hook: fill the two marks."""
+    return markdown.replace("<!-- equations -->", equation_table()).replace("<!-- modules -->", module_reference())

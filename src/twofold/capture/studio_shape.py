@@ -1,0 +1,393 @@
+"""The outer surface of a made person: body, clothes, shoes and hair as one closed mesh in the canonical pose.
+
+Every layer is a signed distance (negative inside, metres) built from the body's own. Their union is meshed, so nothing
+lies hidden under cloth, hems are closed lips, and the mesh is exactly the surface that a camera sees.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage, sparse
+from scipy.spatial import cKDTree
+from skimage.measure import label, marching_cubes
+
+from twofold.body.skeleton import ShapedBody, pose_body
+from twofold.capture.studio_look import Look
+from twofold.geometry.surfaces import split_edges, vertex_normals
+
+SKIN, SHIRT, TROUSERS, SHOES, SOLES, HAIR = range(6)
+"""Layers, in the order of `Figure.layers`."""
+
+COARSE = 0.018
+FINE = COARSE / 3
+_FAR = 0.018
+"""Cells of the coarse grid farther than this from the surface are not looked at again."""
+
+
+class Anatomy(NamedTuple):
+    """Where things are on this body in the T-pose, metres; and dense samples of it in the canonical pose.
+
+    `joints`, `eyes` (left, right), `spread` between the eyes, `crotch`, `crown` and `floor` heights are those of the
+    T-pose; `points` and `normals` of the samples are canonical, `rest` are the same samples in the T-pose.
+    """
+
+    joints: Float[np.ndarray, "24 3"]
+    eyes: Float[np.ndarray, "2 3"]
+    spread: float
+    crotch: float
+    crown: float
+    floor: float
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    rest: Float[np.ndarray, "n 3"]
+    weights: Float[np.ndarray, "n 24"]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A person in the canonical pose, ready to be posed and painted.
+
+    Attributes:
+        vertices: the closed outer surface, metres.
+        faces: triangles.
+        normals: unit.
+        rest: the vertices in the T-pose; patterns are laid out there.
+        weights: skinning weights, at most four a vertex.
+        layers: signed distance of every layer at every vertex; the smallest is the one to see.
+        anatomy: landmarks.
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    normals: Float[np.ndarray, "V 3"]
+    rest: Float[np.ndarray, "V 3"]
+    weights: sparse.csr_matrix
+    layers: Float[np.ndarray, "V 6"]
+    anatomy: Anatomy
+
+
+def survey(shaped: ShapedBody) -> Anatomy:
+    """Find the landmarks of a body."""
+    posed = pose_body(shaped, torch.zeros(24, 3), torch.zeros(3))
+    faces, eyes = _outer_parts(shaped)
+    canonical = posed.canonical_vertices
+    normals = vertex_normals(canonical, faces)
+    dense, dense_faces, parents = split_edges(canonical, faces, torch.ones(len(canonical), dtype=torch.bool))
+    used = torch.unique(dense_faces)
+    # The hollows behind the eyeballs would turn the surface inside out there.
+    for eye in torch.from_numpy(eyes):
+        used = used[((dense[used] - eye).norm(dim=-1) > 0.018) | (dense[used, 2] > eye[2] + 0.004)]
+    dense_normals = normals[parents].mean(1)
+    dense_normals = dense_normals / dense_normals.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    rest_joints = shaped.joints.numpy()
+    points = canonical.numpy()
+    near_middle = (np.abs(points[:, 0]) < 0.012) & (points[:, 1] < rest_joints[0, 1])
+    crotch = points[near_middle, 1].min() if near_middle.any() else rest_joints[1, 1] - 0.09
+    return Anatomy(
+        joints=rest_joints,
+        eyes=eyes,
+        spread=float(np.linalg.norm(eyes[0] - eyes[1])),
+        crotch=float(crotch),
+        crown=float(points[:, 1].max()),
+        floor=float(shaped.vertices[:, 1].min()),
+        points=dense[used].numpy(),
+        normals=dense_normals[used].numpy(),
+        rest=shaped.vertices[parents].mean(1)[used].numpy(),
+        weights=shaped.weights[parents].mean(1)[used].numpy(),
+    )
+
+
+def _outer_parts(shaped: ShapedBody) -> tuple[torch.Tensor, Float[np.ndarray, "2 3"]]:
+    """Faces of the body and its eyeballs (no tongue, no teeth), and where the eyes are."""
+    faces = shaped.faces.numpy()
+    vertices = shaped.vertices.numpy()
+    count = len(vertices)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
+    part = sparse.csgraph.connected_components(graph, directed=False)[1]
+    body = np.bincount(part[faces[:, 0]]).argmax()
+    head, neck = shaped.joints[15].numpy(), shaped.joints[12].numpy()
+    # A body without separate eyeballs: half a neck's length above the head joint, as far apart as people's are.
+    eyes = [head + np.array([s * 0.031, 0.0, 0.085], np.float32) for s in (1, -1)]
+    kept = part == body
+    for label_ in np.unique(part):
+        points = vertices[part == label_]
+        middle, size = points.mean(0), np.ptp(points, axis=0)
+        if label_ != body and size.max() < 0.045 and middle[1] > neck[1] and abs(middle[0]) > 0.015:
+            kept |= part == label_
+            eyes[0 if middle[0] > 0 else 1] = middle.astype(np.float32)
+    return torch.from_numpy(faces[kept[faces[:, 0]]]), np.stack(eyes)
+
+
+def build_figure(shaped: ShapedBody, look: Look) -> Figure:
+    """Dress a body.
+
+    Args:
+        shaped: one person's body in the T-pose.
+        look: what to wear.
+    """
+    anatomy = survey(shaped)
+    tree = cKDTree(anatomy.points)
+    low = anatomy.points.min(0) - 0.09
+    shape = tuple(np.ceil((np.ptp(anatomy.points, axis=0) + 0.18) / COARSE).astype(int) + 1)
+    nodes = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 3)
+    nodes = (low + nodes * COARSE).astype(np.float32)
+    exact, shift = _rough_distance(low, shape, anatomy, tree)
+    blurred = [ndimage.gaussian_filter(exact, sigma / COARSE, mode="nearest") for sigma in (0.008, 0.016, 0.024)]
+    blurred += [ndimage.gaussian_filter(shift[..., axis], 0.02 / COARSE, mode="nearest") for axis in range(3)]
+    coarse = dress(nodes + np.stack([s.ravel() for s in blurred[3:]], -1), [f.ravel() for f in blurred[:3]], anatomy, look)
+    nearest = np.minimum(coarse.min(1), exact.ravel()).reshape(shape)
+    splines = [ndimage.spline_filter(field, order=3, output=np.float32) for field in blurred]
+
+    def evaluate(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 3"]]:
+        """Layers and T-pose positions of points of the canonical pose."""
+        at = ((points - low) / COARSE).T
+        smooth = [ndimage.map_coordinates(s, at, order=3, prefilter=False, mode="nearest") for s in splines[:3]]
+        moved = [ndimage.map_coordinates(s, at, order=1, prefilter=False, mode="nearest") for s in blurred[3:]]
+        rest = points + np.stack(moved, -1)
+        layers = dress(rest, smooth, anatomy, look)
+        # The body itself is looked up exactly only where it may be seen.
+        bare = np.nonzero(layers[:, SKIN] < np.minimum(layers[:, 1:].min(1), 0.012) + 0.012)[0]
+        layers[bare, SKIN] = _skin_distance(points[bare], anatomy, tree)
+        return layers, rest
+
+    vertices, faces = _mesh_union(nearest, low, evaluate)
+    vertices, faces = _refine_bare_skin(vertices, faces, evaluate, anatomy)
+    layers, rest = evaluate(vertices)
+    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
+    weights = _skinning_weights(vertices, faces, layers, anatomy, tree)
+    return Figure(vertices, faces, normals, rest, weights, layers, anatomy)
+
+
+def _rough_distance(
+    low: Float[np.ndarray, "3"], shape: tuple[int, ...], anatomy: Anatomy, tree: cKDTree
+) -> tuple[Float[np.ndarray, "x y z"], Float[np.ndarray, "x y z 3"]]:
+    """On the coarse grid: signed distance to the body, cut off beyond a hand's breadth, and the way to the T-pose."""
+    cells = np.rint((anatomy.points - low) / COARSE).astype(int)
+    shell = np.zeros(shape, bool)
+    shell[tuple(cells.T)] = True
+    shell = ndimage.binary_closing(shell, iterations=2)
+    inside = ndimage.binary_fill_holes(shell)
+    reach = 5
+    near = ndimage.binary_dilation(shell, np.ones((3, 3, 3)), iterations=reach)
+    field = np.where(inside, -reach * COARSE, reach * COARSE).astype(np.float32)
+    shift = np.zeros((*shape, 3), np.float32)
+    points = (low + np.argwhere(near) * COARSE).astype(np.float32)
+    distance, index = tree.query(points)
+    plane = ((points - anatomy.points[index]) * anatomy.normals[index]).sum(1)
+    field[near] = np.where(distance > 0.01, np.copysign(distance, plane), plane).clip(-reach * COARSE, reach * COARSE)
+    shift[near] = _straight_down(points, anatomy.weights[index], anatomy) - points
+    return field, shift
+
+
+def _straight_down(
+    points: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, "n 24"], anatomy: Anatomy
+) -> Float[np.ndarray, "n 3"]:
+    """Points of the canonical pose brought to the T-pose: whatever is the legs' turns back about the hips."""
+    moved = points.copy()
+    for hip, angle, chain in ((1, -np.pi / 6, [1, 4, 7, 10]), (2, np.pi / 6, [2, 5, 8, 11])):
+        share = weights[:, chain].sum(1)
+        x, y = (points - anatomy.joints[hip])[:, :2].T
+        moved[:, 0] += share * (np.cos(angle) * x - np.sin(angle) * y - x)
+        moved[:, 1] += share * (np.sin(angle) * x + np.cos(angle) * y - y)
+    return moved
+
+
+def _skin_distance(points: Float[np.ndarray, "n 3"], anatomy: Anatomy, tree: cKDTree) -> Float[np.ndarray, "n"]:
+    """Signed distance to the body as the weighted mean of the planes of the nearest samples."""
+    distance, index = tree.query(points, k=8)
+    width = 0.5 * distance[:, -1:] ** 2 + 1e-8
+    weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / width)
+    planes = ((points[:, None] - anatomy.points[index]) * anatomy.normals[index]).sum(-1)
+    return ((weight * planes).sum(1) / weight.sum(1)).astype(np.float32)
+
+
+def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
+    """0 below `low`, 1 above `high`, smooth between."""
+    t = np.clip((x - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def arm_reach(points: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
+    """How far along an arm: 0 shoulder, 1 elbow, 2 wrist."""
+    j = anatomy.joints
+    stations = [0.0, abs(j[16, 0]), abs(j[18, 0]), abs(j[20, 0]), abs(j[22, 0])]
+    return np.interp(np.abs(points[:, 0]), stations, [-0.5, 0, 1, 2, 2.5]).astype(np.float32)
+
+
+def leg_reach(points: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
+    """How far along a leg: 0 hip, 1 knee, 2 ankle."""
+    j = anatomy.joints
+    stations = [-j[1, 1], -j[4, 1], -j[7, 1], -anatomy.floor]
+    return np.interp(-points[:, 1], stations, [0, 1, 2, 2.5]).astype(np.float32)
+
+
+def dress(
+    points: Float[np.ndarray, "n 3"], smooth: list[Float[np.ndarray, "n"]], anatomy: Anatomy, look: Look
+) -> Float[np.ndarray, "n 6"]:
+    """Signed distance of every layer.
+
+    Args:
+        points: where, in the T-pose.
+        smooth: the body's signed distance there, blurred a little, more, and most.
+        anatomy: landmarks.
+        look: what to wear.
+    """
+    tight, loose, round_ = smooth
+    layers = [
+        tight,
+        _shirt(points, tight, loose, anatomy, look),
+        _trousers(points, tight, loose, anatomy, look),
+        *_shoes(points, tight, round_, anatomy),
+        _hair(points, round_, anatomy, look),
+    ]
+    return np.stack(layers, -1).astype(np.float32)
+
+
+def _shirt(points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy: Anatomy, look: Look) -> np.ndarray:
+    j, reach = anatomy.joints, arm_reach(points, anatomy)
+    y = points[:, 1]
+    hem = anatomy.crotch + 0.035
+    on_sleeve = smoothstep(0.0, 0.3, reach)
+    toward_hem = 1 - smoothstep(hem, j[9, 1], y)
+    cuff = smoothstep(0.5 * look.sleeve, look.sleeve, reach) if look.sleeve < 1 else -0.3 * smoothstep(1.2, 1.8, reach)
+    offset = 0.011 + on_sleeve * (0.003 + 0.007 * cuff) + (1 - on_sleeve) * 0.011 * toward_hem
+    base = np.minimum(loose - offset, tight - 0.006)
+    shoulder, elbow, wrist = abs(j[16, 0]), abs(j[18, 0]), abs(j[20, 0])
+    end = np.interp(look.sleeve, [0, 1, 2], [shoulder, elbow, wrist])
+    neck = (y - j[12, 1] + 0.012) * 0.82 + (points[:, 2] - j[12, 2]) * 0.57
+    return np.maximum.reduce([base, np.abs(points[:, 0]) - end, hem - y, neck])
+
+
+def _trousers(
+    points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy: Anatomy, look: Look
+) -> np.ndarray:
+    reach = leg_reach(points, anatomy)
+    flare = smoothstep(0.3, 2.0, reach) if look.trouser > 1 else 1.6 * smoothstep(0.2, 0.9, reach)
+    base = np.minimum(loose - 0.009 - 0.010 * flare, tight - 0.005)
+    j = anatomy.joints
+    end = np.interp(look.trouser, [0, 1, 2], [j[1, 1], j[4, 1], j[7, 1]])
+    waist = points[:, 1] - (anatomy.joints[0, 1] + 0.06)
+    return np.maximum.reduce([base, end - points[:, 1], waist])
+
+
+def _shoes(points: np.ndarray, tight: np.ndarray, round_: np.ndarray, anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
+    """The upper, rounded over the toes, and the sole under its outline."""
+    ankle, floor = anatomy.joints[7], anatomy.floor
+    height = points[:, 1] - floor
+    opening = height - 0.085 - 0.25 * (ankle[2] - points[:, 2]).clip(-0.06, 0.05)
+    upper = np.maximum(np.minimum(round_ - 0.013, tight - 0.006), opening)
+    # The samples below the ankle fill the footprint, so their distance in the plane is its outline.
+    print_ = anatomy.rest[anatomy.rest[:, 1] < floor + 0.05]
+    low = points[:, 1] < floor + 0.08
+    outline = np.full(len(points), 1.0, np.float32)
+    outline[low] = cKDTree(print_[:, [0, 2]]).query(points[low][:, [0, 2]], distance_upper_bound=0.2)[0].clip(max=1)
+    thickness = 0.016 + 0.008 * smoothstep(0.0, -0.08, points[:, 2] - ankle[2])
+    slab = np.abs(height - 0.5 * (0.014 - thickness)) - 0.5 * (0.014 + thickness)
+    sole = np.maximum(outline - 0.012, slab)
+    return np.maximum(upper, -height), sole
+
+
+_HAIRLINES = {
+    "short": ((0.0, 0.55, 0.95, 1.2, 1.45, 1.9, 3.15), (1.02, 0.85, 0.35, -0.25, 0.5, -0.3, -1.25)),
+    "curtain": ((0.0, 0.5, 0.85, 1.05, 1.5, 3.15), (1.02, 0.80, 0.1, -1.25, -1.6, -1.75)),
+    "beanie": ((0.0, 0.9, 1.6, 3.15), (0.72, 0.55, 0.35, 0.0)),
+}
+"""Height of the hairline above the eyes, in eye distances, over the angle from the front."""
+
+
+def _hair(points: np.ndarray, round_: np.ndarray, anatomy: Anatomy, look: Look) -> np.ndarray:
+    unit = anatomy.spread
+    eyes, head = anatomy.eyes.mean(0), anatomy.joints[15]
+    near = points[:, 1] > eyes[1] - 4 * unit
+    away = np.full(len(points), 1.0, np.float32)
+    p = points[near] - np.array([0, eyes[1], 0.5 * (eyes[2] + head[2]) - 0.4 * unit], np.float32)
+    angle = np.arctan2(np.abs(p[:, 0]), p[:, 2])
+    style = look.hair if look.hair == "beanie" else "curtain" if look.hair == "bob" else "short"
+    line = np.interp(angle, *_HAIRLINES[style]) * unit
+    above = p[:, 1] - line
+    top = smoothstep(0.5 * unit, 2.0 * unit, p[:, 1])
+    depth = {"crop": 0.010, "quiff": 0.012, "bob": 0.022, "bun": 0.010, "ponytail": 0.010, "curls": 0.026, "beanie": 0.014}
+    thickness = np.full(len(p), depth[look.hair])
+    if look.hair == "quiff":
+        thickness += 0.028 * top * smoothstep(-0.6 * unit, 1.0 * unit, p[:, 2])
+    if look.hair == "curls":
+        thickness += 0.006 * np.sin(p * 190).sum(1) / 1.7 + 0.008 * top
+    elif look.hair != "beanie":
+        thickness += 0.0016 * np.sin(angle * 26 + p[:, 1] * 60)
+    taper = 0.35 + 0.65 * smoothstep(0.0, 0.022, above) if style != "beanie" else np.ones(len(p))
+    shell = np.maximum(round_[near] - 0.004 - thickness * taper, -0.8 * above)
+    if look.hair == "bun":
+        shell = np.minimum(shell, np.linalg.norm(p - np.array([0, 1.75, -1.35]) * unit, axis=1) - 0.66 * unit)
+    if look.hair == "ponytail":
+        shell = np.minimum(shell, _tail(p / unit) * unit)
+    away[near] = shell
+    return away
+
+
+def _tail(p: np.ndarray) -> np.ndarray:
+    """A ponytail from the back of the head, in eye distances."""
+    bends = np.array([[0, 0.9, -1.55], [0, 0.7, -2.25], [0, -0.6, -2.55], [0, -1.9, -2.3]])
+    radii = (0.3, 0.5, 0.45, 0.12)
+    best = np.full(len(p), 9.0)
+    for (a, b), (ra, rb) in zip(zip(bends[:-1], bends[1:], strict=True), zip(radii[:-1], radii[1:], strict=True), strict=True):
+        along = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+        best = np.minimum(best, np.linalg.norm(p - a - along[:, None] * (b - a), axis=1) - ra - along * (rb - ra))
+    return best
+
+
+def _mesh_union(nearest, low, evaluate):  # noqa
+    """Marching cubes of the union on a fine grid, evaluated only near the surface; the outermost piece of it."""
+    volume = nearest.repeat(3, 0).repeat(3, 1).repeat(3, 2)[1:-1, 1:-1, 1:-1].copy()
+    active = (np.abs(nearest) < _FAR).repeat(3, 0).repeat(3, 1).repeat(3, 2)[1:-1, 1:-1, 1:-1]
+    index = np.argwhere(active)
+    volume[active] = evaluate((low + index * FINE).astype(np.float32))[0].min(1)
+    vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(FINE,) * 3, gradient_direction="descent")
+    vertices, faces = (vertices + low).astype(np.float32), faces.astype(np.int64)
+    count = len(vertices)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
+    part = sparse.csgraph.connected_components(graph, directed=False)[1]
+    kept = part == np.bincount(part).argmax()
+    return vertices[kept], (np.cumsum(kept) - 1)[faces[kept[faces[:, 0]]]]
+
+
+def _refine_bare_skin(vertices, faces, evaluate, anatomy):  # noqa
+    """Halve the triangles of face and hands and draw them onto the body, which has finer features than the grid."""
+    head = vertices[:, 1] > anatomy.joints[12, 1]
+    hands = np.abs(vertices[:, 0]) > abs(anatomy.joints[20, 0])
+    fine = head | hands
+    fine[fine] = evaluate(vertices[fine])[0].argmin(1) == SKIN
+    moved, finer, parents = split_edges(*(torch.from_numpy(a) for a in (vertices, faces, fine)))
+    vertices, faces = moved.numpy(), finer.numpy()
+    fine = fine[parents.numpy()].all(1)
+    for _ in range(2):
+        normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
+        here = evaluate(vertices[fine])[0]
+        step = np.clip(here[:, SKIN], -0.003, 0.003) * (here.argmin(1) == SKIN)
+        vertices[fine] -= 0.8 * step[:, None] * normals[fine]
+    return vertices, faces
+
+
+def _skinning_weights(vertices, faces, layers, anatomy, tree):  # noqa
+    """Weights of the nearest body samples; cloth shares them with its neighbourhood, hair follows the head alone."""
+    distance, index = tree.query(vertices, k=6)
+    near = 1 / (distance + 0.004)
+    weights = (near[..., None] * anatomy.weights[index]).sum(1) / near.sum(1)[:, None]
+    label_ = layers.argmin(1)
+    count = len(vertices)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    graph = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
+    average = sparse.diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
+    cloth = np.isin(label_, (SHIRT, TROUSERS))[:, None]
+    for _ in range(12):
+        weights = np.where(cloth, average @ weights, weights)
+    hair = label_ == HAIR
+    weights[hair] = 0
+    weights[hair, 15] = 1
+    fourth = np.partition(weights, -4, axis=1)[:, -4][:, None]
+    weights = np.where((weights >= fourth) & (weights > 1e-4), weights, 0)
+    return sparse.csr_matrix((weights / weights.sum(1, keepdims=True)).astype(np.float32))

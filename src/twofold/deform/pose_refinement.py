@@ -1,0 +1,38 @@
+"""Corrections to estimated poses, learned along with the avatar."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+
+class PoseRefinement(nn.Module):
+    """One correction a training moment (root, body, translation) and one for the shape; all start at zero.
+
+    The correction is added to the axis-angle numbers, which is what optimising the stored poses themselves would do.
+    """
+
+    def __init__(self, times: Int[Tensor, "T"], shapes: int, parts: tuple[str, ...]) -> None:
+        """Tables for the moments `times`; `parts` names what may change: "root", "body", "translation", "shape"."""
+        super().__init__()
+        count = len(times)
+        self.rows = {int(time): row for row, time in enumerate(times)}
+        self.parts = parts
+        self.root = nn.Parameter(torch.zeros(count, 1, 3), requires_grad="root" in parts)
+        self.body = nn.Parameter(torch.zeros(count, 23, 3), requires_grad="body" in parts)
+        self.translation = nn.Parameter(torch.zeros(count, 3), requires_grad="translation" in parts)
+        self.shape = nn.Parameter(torch.zeros(shapes), requires_grad="shape" in parts)
+
+    def forward(
+        self, time: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"]
+    ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
+        """The corrected pose and translation of a moment; moments it does not know stay as they are."""
+        row = self.rows.get(time)
+        if row is None or not self.parts:
+            return pose, translation
+        return pose + torch.cat([self.root[row], self.body[row]]), translation + self.translation[row]
+
+    def change(self) -> dict[str, float]:
+        """Root-mean-square size of the corrections: radians for the rotations, metres for the translation."""
+        tables = {"root": self.root, "body": self.body, "translation": self.translation}
+        norms = {name: t.detach().square().sum(-1).mean().sqrt() for name, t in tables.items()}
+        return {name: float(value) for name, value in norms.items()} | {"shape": float(self.shape.detach().norm())}

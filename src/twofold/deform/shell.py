@@ -1,0 +1,143 @@
+"""The shell: the part of space close to a posed body, as a voxel list that knows each voxel's nearest vertices.
+
+The body is the prior of everything here. A ray is sampled only where it runs through the shell, and the nearest vertex of
+a sample is sought only among the few that its voxel lists, instead of among all of them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from twofold.geometry.cameras import Rays, clip_to_box
+from twofold.volume.rendering import Samples
+
+
+@dataclass(frozen=True)
+class Shell:
+    """Voxels within `radius` of a body's vertices.
+
+    Attributes:
+        low: corner of the voxel grid, metres.
+        voxel: edge of a voxel, metres.
+        radius: distance to the nearest vertex that still counts as inside the shell, metres.
+        row: for each voxel of the grid the row of `nearest` that belongs to it, or -1 outside the shell.
+        nearest: the vertices nearest to each listed voxel's centre, nearest first.
+        vertices: the body's vertices, metres.
+    """
+
+    low: Float[Tensor, "3"]
+    voxel: float
+    radius: float
+    row: Int[Tensor, "X Y Z"]
+    nearest: Int[Tensor, "N C"]
+    vertices: Float[Tensor, "V 3"]
+
+    @property
+    def high(self) -> Float[Tensor, "3"]:
+        """The corner opposite to `low`, metres."""
+        size = torch.tensor(self.row.shape, dtype=self.low.dtype, device=self.low.device)
+        return self.low + self.voxel * size
+
+    def rows_at(self, points: Float[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
+        """Row of the voxel that each point lies in, or -1."""
+        cell = ((points - self.low) * (1 / self.voxel)).floor()
+        x, y, z = self.row.shape
+        flat = (cell[..., 0] * y + cell[..., 1]) * z + cell[..., 2]
+        # Points outside the grid are rare: rays are clipped to it first. A flat index in range may still lie outside.
+        inside = (cell >= 0).all(-1) & (cell[..., 0] < x) & (cell[..., 1] < y) & (cell[..., 2] < z)
+        return torch.where(inside, self.row.flatten()[torch.where(inside, flat, 0).long()], -1).long()
+
+
+def build_shell(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], radius: float, voxel: float, candidates: int = 6
+) -> Shell:
+    """Lists the voxels within `radius` of the vertices, and for each the vertices that may be nearest in it.
+
+    Args:
+        vertices: posed (or canonical) vertices, metres.
+        faces: triangles; their centres count as surface too, for bodies with large triangles.
+        radius: metres.
+        voxel: metres.
+        candidates: how many vertices a voxel lists.
+    """
+    points = vertices.detach().cpu().numpy().astype(np.float32)
+    surface = np.concatenate([points, points[faces.cpu().numpy()].mean(1)])
+    low = surface.min(0) - radius - 2 * voxel
+    shape = np.ceil((surface.max(0) + radius + 2 * voxel - low) / voxel).astype(int)
+    seeds = np.ones(shape, dtype=bool)
+    seeds[tuple(((surface - low) / voxel).astype(int).T)] = False
+    # A voxel is off the surface's own voxel by at most one diagonal, so this keeps a superset of the true shell.
+    near = np.argwhere(ndimage.distance_transform_edt(seeds) * voxel <= radius + np.sqrt(3) * voxel)
+    centers = (low + (near + 0.5) * voxel).astype(np.float32)
+    distance, nearest = cKDTree(points, balanced_tree=False, compact_nodes=False).query(
+        centers, k=candidates, workers=-1, distance_upper_bound=float("inf")
+    )
+    keep = distance[:, 0] <= radius + np.sqrt(3) / 2 * voxel
+    row = np.full(shape, -1, dtype=np.int32)
+    row[tuple(near[keep].T)] = np.arange(keep.sum(), dtype=np.int32)
+    device = vertices.device
+    return Shell(
+        low=torch.as_tensor(low, device=device),
+        voxel=voxel,
+        radius=radius,
+        row=torch.as_tensor(row, device=device),
+        nearest=torch.as_tensor(nearest[keep].astype(np.int32), device=device),
+        vertices=vertices.detach().float(),
+    )
+
+
+def nearest_vertices(
+    shell: Shell, points: Float[Tensor, "S 3"], rows: Int[Tensor, "S"], k: int
+) -> tuple[Int[Tensor, "S k"], Float[Tensor, "S k"]]:
+    """The k nearest vertices of points in the shell and their squared distances (metres squared), nearest first.
+
+    Sought among the candidates of each point's voxel, so a far neighbour can be missed; the nearest one seldom is.
+    """
+    listed = shell.nearest[rows].long()
+    offsets = shell.vertices[listed] - points[:, None]
+    squared = (offsets * offsets).sum(-1)
+    if k == 1:
+        best, which = squared.min(-1, keepdim=True)
+    else:
+        best, which = squared.topk(k, -1, largest=False)
+    return listed.gather(1, which), best
+
+
+def sample_shell(
+    shell: Shell, rays: Rays, step: float, generator: torch.Generator | None
+) -> tuple[Samples, Int[Tensor, "S"]]:
+    """Samples every `step` metres along each ray, kept only where the ray runs through the shell's voxels.
+
+    Args:
+        shell: where to sample.
+        rays: their near and far bounds are respected.
+        step: metres.
+        generator: moves each ray's comb of samples by a random part of a step; None puts samples at mid-step.
+
+    Returns:
+        packed samples, and the shell row of each.
+    """
+    clipped, hit = clip_to_box(rays, shell.low, shell.high)
+    ray_ids = hit.nonzero()[:, 0]
+    device = rays.origins.device
+    if len(ray_ids) == 0:
+        empty = torch.zeros(0, device=device)
+        return Samples(ray_ids, empty, empty), ray_ids
+    clipped = clipped[ray_ids]
+    longest = int(((clipped.far - clipped.near) / step).max().ceil())
+    if generator is None:
+        start = torch.full_like(clipped.near, 0.5)
+    else:
+        start = torch.rand(len(rays), generator=generator, device=generator.device).to(device)[ray_ids]
+    steps = torch.arange(longest, device=device, dtype=clipped.near.dtype)
+    depth = clipped.near[:, None] + step * (steps + start[:, None])
+    points = clipped.origins[:, None] + depth[..., None] * clipped.directions[:, None]
+    rows = shell.rows_at(points)
+    ray, position = ((rows >= 0) & (depth < clipped.far[:, None])).nonzero(as_tuple=True)
+    kept = depth[ray, position]
+    return Samples(ray_ids[ray], kept, torch.full_like(kept, step)), rows[ray, position]

@@ -1,0 +1,145 @@
+"""Evaluation: which frames are measured, how, and the file that says so."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from twofold.capture.types import Capture, Frame
+from twofold.files import write_json
+from twofold.methods.base import Avatar
+from twofold.metrics import image as image_metrics
+from twofold.metrics import shape as shape_metrics
+from twofold.outputs.surface import extract_surface, pose_surface
+from twofold.outputs.views import Picture, draw
+
+
+def evenly(frames: tuple[Frame, ...], most: int | None) -> tuple[Frame, ...]:
+    """At most so many of the frames, evenly spread; None for all."""
+    if most is None or len(frames) <= most:
+        return frames
+    chosen = np.linspace(0, len(frames) - 1, most).round().astype(int)
+    return tuple(frames[i] for i in chosen)
+
+
+def truth(frame: Frame, background: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
+    """A frame's picture on the capture's background, and its mask."""
+    mask = frame.mask()
+    return frame.image() * mask[..., None] + torch.tensor(background) * (1 - mask[..., None]), mask
+
+
+def draw_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) -> Picture:
+    """The avatar in a frame's pose from its camera; `refined` applies what was learned about that moment's pose."""
+    posed = avatar.pose(frame.pose, frame.translation, frame.time if refined else None)
+    return draw(avatar, posed, frame.camera, torch.tensor(capture.background))
+
+
+def measure_split(
+    avatar: Avatar, capture: Capture, split: str, most: int | None = None, refined: bool = False,
+    watch: Callable[[Frame, Picture], None] | None = None,
+) -> dict[str, object]:  # fmt: skip
+    """Means of all picture figures over a split's frames.
+
+    Args:
+        avatar: to measure.
+        capture: with the true pictures.
+        split: "train", "novel_view" or "novel_pose".
+        most: at most so many frames, evenly spread; None for all.
+        refined: use the poses as refined in training where a moment was trained on.
+        watch: called with every frame and its rendering.
+    """
+    rows = []
+    frames = evenly(capture.splits.get(split, ()), most)
+    for frame in frames:
+        picture = draw_frame(avatar, capture, frame, refined)
+        image, mask = truth(frame, capture.background)
+        rows.append(image_metrics.compare(picture.color, image, picture.opacity, mask))
+        if watch:
+            watch(frame, picture)
+    if not rows:
+        return {}
+    means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    poses = "as refined in training" if refined else "as the capture gives them"
+    times = len({frame.time for frame in frames})
+    cameras = len({frame.camera_name for frame in frames})
+    means["protocol"] = {
+        **image_metrics.PROTOCOLS,
+        "frames": f"mean over {len(frames)} pictures of the split {split}: {times} moments, {cameras} cameras",
+        "poses": poses,
+        "background": f"constant {capture.background}",
+    }
+    return means
+
+
+def measure_geometry(
+    avatar: Avatar, capture: Capture, most: int | None = None, voxel: float = 0.008
+) -> dict[str, object]:
+    """Means of the surface figures over the moments whose true mesh is known; empty where none is."""
+    moments = {f.time: f for split in ("novel_view", "novel_pose", "train") for f in capture.splits.get(split, ())}
+    times = [time for time in sorted(capture.meshes) if time in moments]
+    if most is not None and len(times) > most:
+        times = [times[i] for i in np.linspace(0, len(times) - 1, most).round().astype(int)]
+    rows = []
+    for time in times:
+        frame = moments[time]
+        posed = avatar.pose(frame.pose, frame.translation, None)
+        device = posed.body.vertices.device
+        surface, faces = extract_surface(
+            lambda x, posed=posed: avatar.level(x.to(device), posed), posed.body.canonical_vertices, voxel
+        )
+        vertices = pose_surface(surface, posed.body)
+        with np.load(capture.meshes[time]) as mesh:
+            true_vertices, true_faces = torch.as_tensor(mesh["vertices"]), torch.as_tensor(mesh["faces"])
+        rows.append(
+            shape_metrics.compare_surfaces(vertices.cpu(), faces.cpu(), true_vertices.float(), true_faces.long())
+        )
+    if not rows:
+        return {}
+    means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    means["protocol"] = {
+        **shape_metrics.PROTOCOLS,
+        "surface": f"marching cubes of the signed distance at {1000 * voxel:g} mm in canonical space, largest piece, posed by "
+        "the 7 nearest body vertices",
+        "moments": f"mean over {len(rows)} moments with a true mesh",
+    }
+    return means
+
+
+def evaluate(
+    avatar: Avatar, capture: Capture, folder: Path, most: int | None = None, meshes: int | None = 4,
+    watch: Callable[[str, Frame, Picture], None] | None = None, extra: dict[str, object] | None = None,
+) -> dict[str, object]:  # fmt: skip
+    """Measures everything that the capture knows the truth of and writes `metrics.json` into the run.
+
+    Args:
+        avatar: to measure.
+        capture: with the truth.
+        folder: the run.
+        most: at most so many pictures a split.
+        meshes: at most so many true meshes.
+        watch: called with the split, frame and rendering of each test picture.
+        extra: further sections for the file.
+    """
+    metrics: dict[str, object] = {}
+    for split in ("novel_view", "novel_pose"):
+        part = measure_split(
+            avatar, capture, split, most, watch=(lambda f, p, s=split: watch(s, f, p)) if watch else None
+        )
+        if part:
+            metrics[split] = part
+    metrics["train"] = measure_split(avatar, capture, "train", min(most or 8, 8), refined=True)
+    geometry = measure_geometry(avatar, capture, meshes)
+    if geometry:
+        metrics["geometry"] = geometry
+    refinement = getattr(avatar, "refinement", None)
+    if refinement is not None:
+        metrics["pose_refinement"] = {
+            **refinement.change(),
+            "protocol": "root mean square change of root and body rotations (radians) and translation (metres) over the "
+            "training moments; shape: length of the change of the coefficients",
+        }
+    metrics |= extra or {}
+    write_json(folder / "metrics.json", metrics)
+    return metrics

@@ -1,0 +1,235 @@
+"""The two-branch field on feature grids: the paper's idea at a price that a laptop can pay.
+
+The low branch sees only coarse grid levels and the body; the high branch sees fine levels, the pose, and the low branch's
+features. Distances, colours, gates and losses are those of the network form in `factorized`.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from twofold.body.skeleton import PosedBody
+from twofold.field.grids import FeatureGrid, Lattices, body_distance, build_lattices, interpolate, interpolation_pullback
+from twofold.field.output import FieldOutput
+
+
+@dataclass(frozen=True)
+class GridFieldConfig:
+    """The factorized field on feature grids."""
+
+    low_voxels: tuple[float, ...] = (0.12, 0.06)
+    """Grid spacings of the pose-independent branch, metres."""
+    high_voxels: tuple[float, ...] = (0.025, 0.0125)
+    """Grid spacings of the pose-dependent branch, metres."""
+    features: int = 4
+    """Numbers per grid node."""
+    width: int = 32
+    """Hidden units of the small networks."""
+    shared: int = 16
+    """Size of the features handed from one network to the next."""
+    pose_code: int = 8
+    """The pose is squeezed to this many numbers before the pose-dependent branch sees it."""
+    radius: float = 0.1
+    """Features exist this far from the canonical body, metres; at least the shell's radius."""
+    gate_width: float | None = 0.05
+    """Distance from the low branch's surface at which the high branch has half its effect, metres; none for plain sums."""
+    branches: Literal["both", "low", "high", "high_rendered"] = "both"
+    """Which branches exist and are rendered; all but "both" are ablations."""
+    share_features: bool = True
+    """Whether the high branch sees the low branch's features; off is the ablation "w/o feat"."""
+    pose_into: Literal["high", "low"] = "high"
+    """Which branch sees the pose; "low" is the ablation "Pose_lf"."""
+
+    def build(self, body: PosedBody, pose_size: int = 69, generator: torch.Generator | None = None) -> "GridField":
+        """A field around `body` in its canonical pose."""
+        return GridField(self, body, pose_size, generator)
+
+
+class SmallNet(nn.Module):
+    """Two hidden layers whose input gradient is a second, hand-written pass."""
+
+    def __init__(self, inputs: int, width: int, outputs: int, condition: int, generator: torch.Generator | None) -> None:
+        """He-initialised layers; the last one starts near zero, so a branch starts as a small correction."""
+        super().__init__()
+        self.first = nn.Linear(inputs, width)
+        self.second = nn.Linear(width, width)
+        self.last = nn.Linear(width, outputs)
+        self.condition = nn.Linear(condition, width, bias=False) if condition else None
+        for layer, gain in ((self.first, 1.0), (self.second, 1.0), (self.last, 0.1)):
+            nn.init.kaiming_normal_(layer.weight, generator=generator)
+            layer.weight.data *= gain
+            nn.init.zeros_(layer.bias)
+        if self.condition is not None:
+            nn.init.kaiming_normal_(self.condition.weight, generator=generator)
+
+    def forward(self, x: Tensor, condition: Tensor | None) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """Outputs and the tape that `pullback` needs."""
+        bias = self.first.bias
+        if self.condition is not None and condition is not None:
+            # One pose a call: its part of the first layer is a bias, not a column of every sample.
+            bias = bias + self.condition(condition)
+        a = F.relu(F.linear(x, self.first.weight, bias))
+        b = F.relu(self.second(a))
+        return self.last(b), (a, b)
+
+    def pullback(self, tape: tuple[Tensor, Tensor], cotangent: Tensor) -> Tensor:
+        """Cotangent of the input from that of the output."""
+        a, b = tape
+        u = (cotangent @ self.last.weight) * (b > 0)
+        return ((u @ self.second.weight) * (a > 0)) @ self.first.weight
+
+
+class _Geometry:
+    """Distances (s), features (f), gradients (g) and gate of one call; 1 is the low branch, 2 the high one."""
+
+    __slots__ = ("code", "f1", "f2", "g", "g1", "gate", "high", "low", "s", "s1", "s2")
+
+    def __init__(self, code: Tensor | None) -> None:
+        nothing = torch.zeros(0)
+        self.code = code
+        self.low = self.high = self.s1 = self.s2 = self.f1 = self.f2 = nothing
+        self.s = self.gate = self.g = self.g1 = nothing
+
+
+class GridField(nn.Module):
+    """See `GridFieldConfig`; answers like `factorized.FactorizedField`."""
+
+    def __init__(
+        self, config: GridFieldConfig, body: PosedBody, pose_size: int, generator: torch.Generator | None
+    ) -> None:
+        """Starts as the naked body, grey."""
+        super().__init__()
+        self.config = config
+        vertices = body.canonical_vertices.detach().cpu().numpy().astype(np.float32)
+        faces = body.faces.cpu().numpy()
+        points = np.concatenate([vertices, vertices[faces].mean(1)])
+        lattices, nodes = build_lattices(points, (0.02,), config.radius)
+        prior = body_distance(nodes, vertices, faces)
+        prior[0] = config.radius
+        self.register_buffer("prior", torch.from_numpy(prior)[:, None].contiguous(), persistent=False)
+        self.register_buffer("prior_rows", lattices.rows, persistent=False)
+        self.register_buffer("prior_place", lattices.place, persistent=False)
+        self.register_buffer("prior_shape", lattices.shape, persistent=False)
+        shared, width, code = config.shared, config.width, config.pose_code
+        self.has_low = config.branches != "high"
+        self.has_high = config.branches != "low"
+        handed = shared if self.has_low and config.share_features else 0
+        low_code = code if config.pose_into == "low" and self.has_low else 0
+        high_code = code if config.pose_into == "high" or not self.has_low else 0
+        if low_code or (self.has_high and high_code):
+            self.pose_code = nn.Linear(pose_size, code, bias=False)
+            nn.init.normal_(self.pose_code.weight, std=0.3, generator=generator)
+        if self.has_low:
+            self.low_grid = FeatureGrid(points, config.low_voxels, config.features, config.radius, generator)
+            size = self.low_grid.size
+            self.low_sdf = SmallNet(size, width, 1 + shared, low_code, generator)
+            self.low_color = SmallNet(size + shared + 3, width, 3 + shared, low_code, generator)
+        if self.has_high:
+            self.high_grid = FeatureGrid(points, config.high_voxels, config.features, config.radius, generator)
+            size = self.high_grid.size
+            self.high_sdf = SmallNet(size + handed, width, 1 + shared, high_code, generator)
+            self.high_color = SmallNet(size + shared + handed + 3, width, 3, high_code, generator)
+        self.handed = handed
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by what they are: grid tables, and networks of either branch."""
+        groups: dict[str, list[nn.Parameter]] = {"grid": [], "low": [], "high": []}
+        for name, parameter in self.named_parameters():
+            kind = "grid" if "grid" in name else "low" if name.startswith("low") else "high"
+            groups[kind].append(parameter)
+        return groups
+
+    def _geometry(self, x: Tensor, pose: Tensor, slopes: Literal["none", "constant", "trained"]) -> _Geometry:
+        """Distances and features of both branches; `slopes` says whether their gradients by x are wanted too."""
+        g = _Geometry(self.pose_code(pose) if hasattr(self, "pose_code") else None)
+        lattices = Lattices(self.prior_rows, self.prior_place, self.prior_shape)
+        prior = interpolate(self.prior, x, lattices)[:, 0]
+        tape = tape2 = (x, x)
+        if self.has_low:
+            g.low = self.low_grid(x)
+            answer, tape = self.low_sdf(g.low, g.code)
+            # A tenth of the output: distances are centimetres, network outputs of order one.
+            g.s1, g.f1 = prior + 0.1 * answer[:, 0], answer[:, 1:]
+        if self.has_high:
+            g.high = self.high_grid(x)
+            answer2, tape2 = self.high_sdf(torch.cat([g.high, g.f1], -1) if self.handed else g.high, g.code)
+            g.s2, g.f2 = 0.1 * answer2[:, 0], answer2[:, 1:]
+        alone = not self.has_low or self.config.branches == "high_rendered"
+        if alone:
+            g.s = prior + g.s2
+        elif not self.has_high:
+            g.s = g.s1
+        else:
+            g.gate = self._gate(g.s1)
+            g.s = g.s1 + g.gate * g.s2
+        if slopes == "none":
+            return g
+        with torch.set_grad_enabled(torch.is_grad_enabled() and slopes == "trained"):
+            # The reverse pass, by hand: head, networks, grids.
+            head = torch.zeros(len(x), 1 + self.config.shared, dtype=x.dtype, device=x.device)
+            head[:, 0] = 0.1
+            slope = interpolation_pullback(self.prior, x, torch.ones_like(prior)[:, None], lattices)
+            if self.has_low:
+                g.g1 = slope + self.low_grid.pullback(x, self.low_sdf.pullback(tape, head)[:, : self.low_grid.size])
+                g.g = g.g1
+            if self.has_high:
+                u = self.high_sdf.pullback(tape2, head)
+                g2 = self.high_grid.pullback(x, u[:, : self.high_grid.size])
+                if self.handed:
+                    back = torch.cat([torch.zeros_like(u[:, :1]), u[:, self.high_grid.size :]], -1)
+                    g2 = g2 + self.low_grid.pullback(x, self.low_sdf.pullback(tape, back))
+                g.g = slope + g2 if alone else g.g1 + g.gate[:, None] * g2
+        return g
+
+    def _gate(self, s1: Tensor) -> Tensor:
+        if self.config.gate_width is None:
+            return torch.ones_like(s1)
+        return 1 / (1 + (s1.detach() / self.config.gate_width) ** 4)
+
+    def sdf(self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> Float[Tensor, "S"]:
+        """Signed distance alone, metres."""
+        return self._geometry(x, pose, "none").s
+
+    def distance_and_gradient(
+        self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
+    ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
+        """Signed distance and its canonical gradient, both differentiable by the parameters."""
+        out = self._geometry(x, pose, "trained")
+        return out.s, out.g
+
+    def forward(
+        self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"], to_observation: Float[Tensor, "S 3 3"] | None
+    ) -> FieldOutput:
+        """Distances and colours of the whole and of the base branch.
+
+        Args:
+            x: points of canonical space, metres.
+            pose: what the pose-dependent branch is told.
+            to_observation: turns canonical gradients into those of observation space; None leaves them.
+        """
+        # Normals enter the colours as constants: the shape learns from densities, at half the cost.
+        g = self._geometry(x, pose, "constant")
+
+        def turned(gradient: Tensor) -> Tensor:
+            if to_observation is not None:
+                gradient = (to_observation.detach() * gradient[:, None]).sum(-1)
+            return F.normalize(gradient, dim=-1)
+
+        base, color, feature = None, torch.zeros_like(x), None
+        if self.has_low:
+            answer, _ = self.low_color(torch.cat([g.low, g.f1, turned(g.g1)], -1), g.code)
+            color, feature = torch.sigmoid(answer[:, :3]), answer[:, 3:]
+            base = FieldOutput(g.s1, color, g.g1)
+        if self.has_high:
+            parts = [g.high, g.f2, turned(g.g)]
+            if self.handed and feature is not None:
+                parts.append(F.relu(feature))
+            residual, _ = self.high_color(torch.cat(parts, -1), g.code)
+            alone = base is None or self.config.branches == "high_rendered"
+            color = torch.sigmoid(residual) if alone else color + g.gate[:, None] * residual
+        return FieldOutput(g.s, color, g.g, base if self.config.branches in ("both", "high_rendered") else None)

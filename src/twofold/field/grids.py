@@ -1,0 +1,243 @@
+"""Feature grids around the canonical body: a trilinear encoding whose coarse levels carry low frequencies only.
+
+A level is a regular lattice of feature vectors, kept only at the nodes near the body. Its spacing bounds the frequencies
+that it can hold just as the octaves of a Fourier encoding do (half a period per cell), and eight lookups cost far less
+than a wide network.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from twofold.field import grid_kernels as kernels
+
+
+@dataclass(frozen=True)
+class Lattices:
+    """Where the nodes of all levels lie.
+
+    Attributes:
+        rows: table row of every node, level after level; nodes far from the body share their level's first row.
+        place: lower corner (metres) and inverse spacing (1 / metres) of each level.
+        shape: nodes along each axis, and where the level begins in `rows`.
+    """
+
+    rows: Int[Tensor, "nodes"]
+    place: Float[Tensor, "L 4"]
+    shape: Int[Tensor, "L 4"]
+
+
+def build_lattices(
+    points: Float[np.ndarray, "n 3"], voxels: tuple[float, ...], radius: float
+) -> tuple[Lattices, Float[np.ndarray, "N 3"]]:
+    """The nodes within `radius` metres (plus a cell's diagonal) of surface points, for each spacing.
+
+    Returns:
+        the lattices, and the position of each table row (a level's first row stands for everywhere else).
+    """
+    rows, places, shapes, positions = [], [], [], []
+    count = begin = 0
+    for voxel in voxels:
+        reach = radius + np.sqrt(3) * voxel
+        low = points.min(0) - reach - voxel
+        shape = np.ceil((points.max(0) + reach + voxel - low) / voxel).astype(int) + 1
+        empty = np.ones(shape, dtype=bool)
+        empty[tuple(np.round((points - low) / voxel).astype(int).T)] = False
+        nodes = np.argwhere(ndimage.distance_transform_edt(empty) * voxel <= reach + voxel)
+        row = np.full(shape, count, dtype=np.int32)
+        row[tuple(nodes.T)] = np.arange(count + 1, count + 1 + len(nodes), dtype=np.int32)
+        rows.append(row.ravel())
+        places.append([*low, 1 / voxel])
+        shapes.append([*shape, begin])
+        positions.extend([points.mean(0, keepdims=True), low + nodes * voxel])
+        count += len(nodes) + 1
+        begin += row.size
+    lattices = Lattices(
+        rows=torch.from_numpy(np.concatenate(rows)),
+        place=torch.tensor(np.array(places), dtype=torch.float32),
+        shape=torch.tensor(np.array(shapes), dtype=torch.int64),
+    )
+    return lattices, np.concatenate(positions).astype(np.float32)
+
+
+def corners(x: Float[Tensor, "S 3"], lattices: Lattices, level: int) -> tuple[Int[Tensor, "S 8"], Float[Tensor, "S 3"]]:
+    """Table rows of the eight nodes around each point, and its position in the cell (0..1), in PyTorch."""
+    shape = lattices.shape[level]
+    unit = (x - lattices.place[level, :3].to(x.dtype)) * lattices.place[level, 3].to(x.dtype)
+    unit = torch.minimum(unit.clamp_min(0), shape[:3].to(x.dtype) - 1.001)
+    cell = unit.floor()
+    whole = cell.long()
+    base = shape[3] + (whole[:, 0] * shape[1] + whole[:, 1]) * shape[2] + whole[:, 2]
+    offsets = torch.stack([(a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)])
+    return lattices.rows[base[:, None] + offsets].long(), unit - cell
+
+
+def interpolate_in_torch(
+    table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], lattices: Lattices
+) -> Float[Tensor, "S LC"]:
+    """`interpolate` by ordinary PyTorch operations, with all derivatives: the path of GPUs, and the compiled form's twin."""
+    features = []
+    for level in range(len(lattices.place)):
+        index, part = corners(x, lattices, level)
+        both = torch.stack([1 - part, part], -1)
+        xy = both[:, 0, :, None] * both[:, 1, None, :]
+        weights = (xy[..., None] * both[:, 2, None, None, :]).flatten(1)
+        features.append((weights[..., None] * table[index]).sum(1))
+    return torch.cat(features, -1)
+
+
+def pullback_in_torch(
+    table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], cotangent: Float[Tensor, "S LC"], lattices: Lattices
+) -> Float[Tensor, "S 3"]:
+    """`interpolation_pullback` by ordinary PyTorch operations."""
+    total = torch.zeros_like(x)
+    for level, u in enumerate(cotangent.chunk(len(lattices.place), -1)):
+        index, part = corners(x.detach(), lattices, level)
+        along = (table[index] * u[:, None]).sum(-1).unflatten(-1, (2, 2, 2))
+        both = torch.stack([1 - part, part], -1)
+        slope = torch.tensor([-1.0, 1.0], dtype=x.dtype, device=x.device) * lattices.place[level, 3].to(x.dtype)
+        slope = slope.expand(len(x), 2)
+        gradients = []
+        for axis in range(3):
+            factors = [slope if a == axis else both[:, a] for a in range(3)]
+            gradients.append(torch.einsum("sabc,sa,sb,sc->s", along, *factors))
+        total = total + torch.stack(gradients, -1)
+    return total
+
+
+def _arrays(lattices: Lattices) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return lattices.rows.numpy(), lattices.place.numpy(), lattices.shape.numpy()
+
+
+class _Interpolate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, table: Tensor, x: Tensor, lattices: Lattices) -> Tensor:  # type: ignore[override]
+        ctx.save_for_backward(table, x)
+        ctx.lattices = lattices
+        out = np.empty((len(x), table.shape[1] * len(lattices.place)), dtype=np.float32)
+        kernels.interpolate(x.detach().contiguous().numpy(), table.detach().numpy(), *_arrays(lattices), out)
+        return torch.from_numpy(out)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # type: ignore[override]
+        table, x = ctx.saved_tensors
+        points, slopes, arrays = x.contiguous().numpy(), gradient.contiguous().numpy(), _arrays(ctx.lattices)
+        by_table = by_x = None
+        if ctx.needs_input_grad[0]:
+            by_table = torch.zeros_like(table)
+            kernels.scatter(points, slopes, *arrays, by_table.numpy())
+        if ctx.needs_input_grad[1]:
+            by_x = torch.empty_like(x)
+            kernels.pull(points, table.detach().numpy(), slopes, *arrays, by_x.numpy())
+        return by_table, by_x, None
+
+
+class _Pullback(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, table: Tensor, x: Tensor, cotangent: Tensor, lattices: Lattices) -> Tensor:  # type: ignore[override]
+        x, cotangent = x.detach().contiguous(), cotangent.detach().contiguous()
+        ctx.save_for_backward(table, x, cotangent)
+        ctx.lattices = lattices
+        out = torch.empty(len(x), 3)
+        kernels.pull(x.numpy(), table.detach().numpy(), cotangent.numpy(), *_arrays(lattices), out.numpy())
+        return out
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, None, Tensor | None, None]:  # type: ignore[override]
+        table, x, cotangent = ctx.saved_tensors
+        arrays, slopes = _arrays(ctx.lattices), gradient.contiguous().numpy()
+        by_table = by_cotangent = None
+        if ctx.needs_input_grad[0]:
+            by_table = torch.zeros_like(table)
+            kernels.pull_scatter(x.numpy(), cotangent.numpy(), slopes, *arrays, by_table.numpy())
+        if ctx.needs_input_grad[2]:
+            by_cotangent = torch.empty_like(cotangent)
+            kernels.push(x.numpy(), table.detach().numpy(), slopes, *arrays, by_cotangent.numpy())
+        return by_table, None, by_cotangent, None
+
+
+def interpolate(table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], lattices: Lattices) -> Float[Tensor, "S LC"]:
+    """Trilinear features of all levels side by side; differentiable by the table and by the points."""
+    if table.dtype != torch.float32 or table.is_cuda:
+        return interpolate_in_torch(table, x, lattices)
+    return _Interpolate.apply(table, x, lattices)  # type: ignore[return-value]
+
+
+def interpolation_pullback(
+    table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], cotangent: Float[Tensor, "S LC"], lattices: Lattices
+) -> Float[Tensor, "S 3"]:
+    """J^T u, where J is the Jacobian of `interpolate` by the points: the last step of a gradient's reverse pass.
+
+    Differentiable by the table and the cotangent, so a loss on the gradient trains both; the points count as constants.
+    """
+    if table.dtype != torch.float32 or table.is_cuda:
+        return pullback_in_torch(table, x, cotangent, lattices)
+    return _Pullback.apply(table, x, cotangent, lattices)  # type: ignore[return-value]
+
+
+class FeatureGrid(nn.Module):
+    """Several lattices around a canonical body with one feature table, trainable or given."""
+
+    def __init__(
+        self, points: Float[np.ndarray, "n 3"], voxels: tuple[float, ...], features: int, radius: float,
+        generator: torch.Generator | None = None,
+    ) -> None:  # fmt: skip
+        """Features near zero at the nodes within `radius` metres of `points`."""
+        super().__init__()
+        lattices, _ = build_lattices(points, voxels, radius)
+        # Rebuilt from the body when a run is loaded, hence not part of its state.
+        self.register_buffer("rows", lattices.rows, persistent=False)
+        self.register_buffer("place", lattices.place, persistent=False)
+        self.register_buffer("shape", lattices.shape, persistent=False)
+        count = int(lattices.rows.max()) + 1
+        self.table = nn.Parameter((torch.rand(count, features, generator=generator) - 0.5) * 2e-3)
+        self.size = features * len(voxels)
+
+    @property
+    def lattices(self) -> Lattices:
+        """Where its nodes lie."""
+        return Lattices(self.get_buffer("rows"), self.get_buffer("place"), self.get_buffer("shape"))
+
+    def forward(self, x: Float[Tensor, "S 3"]) -> Float[Tensor, "S LC"]:
+        """Features at points of canonical space."""
+        return interpolate(self.table, x, self.lattices)
+
+    def pullback(self, x: Float[Tensor, "S 3"], cotangent: Float[Tensor, "S LC"]) -> Float[Tensor, "S 3"]:
+        """J^T u of `forward`; see `interpolation_pullback`."""
+        return interpolation_pullback(self.table, x, cotangent, self.lattices)
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """Unit normals, outward, each face weighted by its area."""
+    corners = vertices[faces]
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], face)
+    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+
+
+def body_distance(
+    points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "n"]:
+    """Approximate signed distance to a body, metres, negative inside.
+
+    The offsets to the nearest vertices, projected on their normals and averaged: exact to a few millimetres near the
+    surface, which is all that a prior needs.
+    """
+    normals = vertex_normals(vertices, faces)
+    distance, nearest = cKDTree(vertices).query(points, k=6, workers=-1)
+    along = ((points[:, None] - vertices[nearest]) * normals[nearest]).sum(-1)
+    shares = 1 / np.maximum(distance, 1e-4) ** 2
+    mean = (along * shares).sum(-1) / shares.sum(-1)
+    # Close to the surface the projection is the distance; further out the nearest vertex says how far.
+    far = np.sign(mean) * distance[:, 0]
+    return np.where(distance[:, 0] < 0.02, mean, far).astype(np.float32)

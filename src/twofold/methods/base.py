@@ -1,0 +1,157 @@
+"""What every method promises: an avatar that can be posed, rendered, trained and turned into a surface."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from twofold.body.skeleton import Body, PosedBody
+from twofold.capture.pixels import Batch
+from twofold.capture.types import Capture
+from twofold.deform.shell import Shell
+from twofold.errors import TwofoldError
+from twofold.geometry.cameras import Rays
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The person that an avatar is made of: body and training motion. A run folder carries it as arrays.
+
+    Attributes:
+        body: the body model.
+        betas: its shape coefficients.
+        times: moments of the training frames, ascending.
+        poses: their axis-angle rotations, radians.
+        translations: their translations, metres.
+        scene_scale: what the authors' release multiplies lengths with (3 / (1.1 times the furthest camera)).
+    """
+
+    body: Body
+    betas: Float[Tensor, "S"]
+    times: Int[Tensor, "T"]
+    poses: Float[Tensor, "T 24 3"]
+    translations: Float[Tensor, "T 3"]
+    scene_scale: float
+
+    @staticmethod
+    def of(capture: Capture) -> "Subject":
+        """The subject of a capture's training frames."""
+        moments = {frame.time: frame for frame in capture.train}
+        frames = [moments[time] for time in sorted(moments)]
+        middle = torch.stack([f.translation + capture.body.joints[0] for f in frames]).mean(0)
+        away = max(float((f.camera.center - middle).norm()) for f in frames)
+        return Subject(
+            body=capture.body,
+            betas=capture.betas,
+            times=torch.tensor([f.time for f in frames]),
+            poses=torch.stack([f.pose for f in frames]),
+            translations=torch.stack([f.translation for f in frames]),
+            scene_scale=3 / (1.1 * away),
+        )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """As a run folder stores it."""
+        own = {"betas": self.betas, "times": self.times, "poses": self.poses, "translations": self.translations}
+        body = {f"body_{name}": array for name, array in self.body.arrays().items()}
+        return {**{name: t.numpy() for name, t in own.items()}, **body, "scene_scale": np.array(self.scene_scale)}
+
+    @staticmethod
+    def from_arrays(arrays: dict[str, np.ndarray], where: str) -> "Subject":
+        """What `arrays` gave, read back.
+
+        Raises:
+            TwofoldError: something is missing or has the wrong shape.
+        """
+        names = ("betas", "times", "poses", "translations", "scene_scale")
+        missing = [name for name in names if name not in arrays]
+        if missing:
+            raise TwofoldError(f"{where} lacks {', '.join(missing)}; it is damaged, train again.")
+        body = Body.from_arrays({n[5:]: a for n, a in arrays.items() if n.startswith("body_")}, where)
+        times, poses, translations = arrays["times"], arrays["poses"], arrays["translations"]
+        if poses.shape != (len(times), 24, 3) or translations.shape != (len(times), 3):
+            raise TwofoldError(f"{where} holds {len(times)} moments but poses {poses.shape}; it is damaged, train again.")
+        return Subject(
+            body=body,
+            betas=torch.as_tensor(arrays["betas"]).float(),
+            times=torch.as_tensor(times).long(),
+            poses=torch.as_tensor(poses).float(),
+            translations=torch.as_tensor(translations).float(),
+            scene_scale=float(arrays["scene_scale"]),
+        )
+
+
+@dataclass(frozen=True)
+class PosedAvatar:
+    """A body in a pose with what rendering derives from it once.
+
+    Attributes:
+        body: the posed body.
+        forward: canonical-to-posed transform at each vertex.
+        condition: what the pose-dependent branch is told.
+        shell: where to sample.
+    """
+
+    body: PosedBody
+    forward: Float[Tensor, "V 3 4"]
+    condition: Float[Tensor, "P"]
+    shell: Shell
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Pixels: colour on the background, opacity, expected depth (metres), normal in observation space (length <= 1).
+
+    `base` is the rendering by the pose-independent branch alone, where a method has one and it was asked for.
+    """
+
+    color: Float[Tensor, "R 3"]
+    opacity: Float[Tensor, "R"]
+    depth: Float[Tensor, "R"]
+    normal: Float[Tensor, "R 3"]
+    base: "Rendering | None" = None
+
+
+class Avatar(nn.Module, ABC):
+    """A person that can be posed and looked at. Everything above methods uses only what stands here."""
+
+    @abstractmethod
+    def pose(
+        self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], time: int | None = None, step: int | None = None
+    ) -> PosedAvatar:
+        """The avatar in a pose.
+
+        Args:
+            pose: axis-angle, root first, radians.
+            translation: SMPL's own, metres.
+            time: a training moment whose learned pose correction is to be applied; None applies none.
+            step: the training step, for schedules; None when not training.
+        """
+
+    @abstractmethod
+    def render(
+        self, rays: Rays, posed: PosedAvatar, background: Float[Tensor, "3"], generator: torch.Generator | None = None
+    ) -> Rendering:
+        """What is seen along rays. With a generator, samples are placed at random (training); without, evenly."""
+
+    @abstractmethod
+    def losses(
+        self, rendering: Rendering, batch: Batch, posed: PosedAvatar, step: int, generator: torch.Generator
+    ) -> dict[str, Float[Tensor, ""]]:
+        """Named loss terms, already weighted; the loop adds them."""
+
+    @abstractmethod
+    def level(
+        self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full"
+    ) -> Float[Tensor, "S"]:
+        """Zero on the surface in canonical space, negative inside; of the "full" field or its "base" branch."""
+
+    @abstractmethod
+    def before_step(self, step: int) -> None:
+        """Called before each training step."""
+
+    @abstractmethod
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Trainable parameters by name of their learning rate."""

@@ -1,0 +1,365 @@
+"""The paper's method: an avatar whose field has a pose-independent and a pose-dependent branch."""
+
+import math
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from twofold import losses
+from twofold.body.skeleton import PosedBody, ShapedBody, pose_body, shape_body
+from twofold.capture.pixels import Batch
+from twofold.deform.pose_refinement import PoseRefinement
+from twofold.deform.shell import Shell, build_shell, nearest_vertices, sample_shell
+from twofold.deform.skinning import neighbour_weights, to_canonical, vertex_transforms
+from twofold.field.factorized import FactorizedFieldConfig
+from twofold.field.factorized_grid import GridFieldConfig
+from twofold.field.output import FieldOutput
+from twofold.geometry.cameras import Rays, clip_to_box
+from twofold.methods.base import Avatar, PosedAvatar, Rendering, Subject
+from twofold.metrics.perceptual import LPIPS
+from twofold.volume.rendering import Samples, composite, composite_weights, laplace_density
+from twofold.volume.samplers import ErrorBoundedSampler
+
+
+@dataclass(frozen=True)
+class ShellSampler:
+    """Samples near the posed body only, and of these only the ones that can be seen."""
+
+    radius: float = 0.06
+    """How far from the body's vertices samples are taken, metres."""
+    step: float = 0.01
+    """Distance of samples on a ray, metres."""
+    voxel: float = 0.02
+    """Edge of the voxels that list where the shell is, metres."""
+    least_weight: float = 1e-3
+    """Samples that would add less than this to their pixel are found by a pass without gradients and left out; 0 keeps all."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss terms; a weight of zero leaves the term out."""
+
+    reconstruction: float = 1.0
+    eikonal: float = 0.1
+    common: float = 0.5
+    lpips: float = 1.0
+    lpips_start: int = 20_000
+    """First step with the perceptual term."""
+    mask: float = 0.1
+    mask_form: Literal["sides", "mean"] = "sides"
+    """"sides": inside and outside rays averaged apart, as released; "mean": plain mean."""
+    s3im: float = 0.1
+    eikonal_points: int = 512
+    """Random canonical body vertices, each moved by a normal deviate."""
+    eikonal_spread: float = 0.01
+    """Standard deviation of that, metres."""
+    reduction: Literal["mean", "sum"] = "mean"
+    """Whether colour differences are averaged over rays and channels, as released, or summed, as printed."""
+
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """What the pose-dependent branch is told, and which poses are corrected while training."""
+
+    divide_by_pi: bool = True
+    with_root: bool = False
+    """Whether the global orientation is part of it."""
+    zero_until: int = 10_000
+    """The branch sees a zero pose before this step."""
+    zero_every: int = 50
+    """Afterwards it sees a zero pose during every epoch whose number is a multiple of this; 0 for never."""
+    drop: float = 0.0
+    """Chance of a zero pose at any training step (ours; the schedule above is the release's)."""
+    refine: tuple[Literal["root", "body", "translation", "shape"], ...] = ("root", "body", "translation", "shape")
+    refine_from: int = 0
+    """First step at which poses are corrected."""
+
+
+@dataclass(frozen=True)
+class FactorizedConfig:
+    """The factorized avatar; the defaults are the authors' release."""
+
+    field: FactorizedFieldConfig | GridFieldConfig = dataclasses.field(default_factory=FactorizedFieldConfig)
+    sampler: ErrorBoundedSampler | ShellSampler = dataclasses.field(default_factory=ShellSampler)
+    losses: LossConfig = dataclasses.field(default_factory=LossConfig)
+    pose: PoseConfig = dataclasses.field(default_factory=PoseConfig)
+    neighbours: int = 1
+    """How many nearest vertices give a point its skinning weights."""
+    beta: float = 0.1
+    """Initial scale of the density, metres."""
+    beta_floor: float = 1e-4
+    """Least scale of the density, metres."""
+    beta_form: Literal["softplus", "absolute"] = "softplus"
+    """How the scale is kept positive; "absolute" is the release's |beta|, which can stall at zero."""
+    outlier_distance: float = 0.1
+    """Points further than this from the body, metres, count as empty."""
+    outliers_in_shading: bool = True
+    """Whether that also holds for the colours; the release forgets it there."""
+    scene_scale: Literal["metres", "released"] = "metres"
+    """"released" measures lengths along rays and outliers in the release's normalised scene units."""
+    shell_refresh: int = 500
+    """Steps after which the shells follow the corrected poses."""
+
+    def build(self, subject: Subject, seed: int = 0) -> "FactorizedAvatar":
+        """An untrained avatar of a subject."""
+        return FactorizedAvatar(self, subject, seed)
+
+
+class FactorizedAvatar(Avatar):
+    """See `FactorizedConfig`."""
+
+    def __init__(self, config: FactorizedConfig, subject: Subject, seed: int) -> None:
+        """Builds the field around the subject's canonical body."""
+        super().__init__()
+        self.config, self.subject = config, subject
+        generator = torch.Generator().manual_seed(seed)
+        self.refinement = PoseRefinement(subject.times, len(subject.betas), tuple(config.pose.refine))
+        canonical = pose_body(shape_body(subject.body, subject.betas), subject.poses[0], subject.translations[0])
+        pose_size = 72 if config.pose.with_root else 69
+        if isinstance(config.field, GridFieldConfig):
+            self.field = config.field.build(canonical, pose_size, generator)
+        else:
+            self.field = config.field.build(pose_size, generator)
+        start = config.beta - config.beta_floor
+        # Softplus with this sharpness is nearly linear at the start, yet never reaches zero.
+        raw = start if config.beta_form == "absolute" else _inverse_softplus(start / _BETA_UNIT) * _BETA_UNIT
+        self.raw_beta = nn.Parameter(torch.tensor(float(raw)))
+        self.scale = subject.scene_scale if config.scene_scale == "released" else 1.0
+        # Shells are made of the poses as they were at the last refresh; kept so that a resumed run repeats them.
+        self.register_buffer("shell_poses", subject.poses.clone())
+        self.register_buffer("shell_translations", subject.translations.clone())
+        self.register_buffer("canonical_points", canonical.canonical_vertices.clone(), persistent=False)
+        self.register_buffer("basis", torch.zeros(0), persistent=False)
+        self._shells: dict[int, Shell] = {}
+        self._shaped: ShapedBody | None = None
+        self.lpips: LPIPS | None = None
+
+    @property
+    def device(self) -> torch.device:
+        """Where its parameters are."""
+        return self.raw_beta.device
+
+    @property
+    def beta(self) -> Float[Tensor, ""]:
+        """Scale of the density, metres."""
+        if self.config.beta_form == "absolute":
+            return self.raw_beta.abs() + self.config.beta_floor
+        return F.softplus(self.raw_beta / _BETA_UNIT) * _BETA_UNIT + self.config.beta_floor
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """The field's groups, "beta" and "pose"."""
+        pose = [p for p in self.refinement.parameters() if p.requires_grad]
+        return {**self.field.parameter_groups(), "beta": [self.raw_beta], "pose": pose}
+
+    def before_step(self, step: int) -> None:
+        """Lets the shells follow the corrected poses from time to time."""
+        refresh = self.config.shell_refresh
+        if not self.refinement.parts or step == 0 or step % refresh or step < self.config.pose.refine_from:
+            return
+        with torch.no_grad():
+            for row, time in enumerate(self.subject.times):
+                pose, translation = self.subject.poses[row], self.subject.translations[row]
+                pose, translation = self.refinement(int(time), pose.to(self.device), translation.to(self.device))
+                self.shell_poses[row], self.shell_translations[row] = pose, translation
+        self._shells.clear()
+
+    def pose(
+        self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], time: int | None = None, step: int | None = None
+    ) -> PosedAvatar:
+        """See `Avatar.pose`. While training, a moment's shell is reused until the next refresh."""
+        pose, translation = pose.to(self.device), translation.to(self.device)
+        training = step is not None
+        refining = training and step >= self.config.pose.refine_from
+        if time is not None:
+            with torch.set_grad_enabled(torch.is_grad_enabled() and refining):
+                pose, translation = self.refinement(time, pose, translation)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and refining and bool(self.refinement.parts)):
+            body = pose_body(self._shape(), pose, translation)
+            forward = vertex_transforms(body)
+        return PosedAvatar(body, forward, self._condition(pose, step), self._shell(body, time, training))
+
+    def _shape(self) -> ShapedBody:
+        betas = self.subject.betas.to(self.device) + self.refinement.shape
+        body = self.subject.body
+        if self.device.type != "cpu":
+            tensors = {n: t.to(self.device) for n, t in vars(body).items() if isinstance(t, Tensor)}
+            body = type(body)(name=body.name, **tensors)
+        return shape_body(body, betas)
+
+    def _condition(self, pose: Tensor, step: int | None) -> Tensor:
+        config = self.config.pose
+        told = (pose if config.with_root else pose[1:]).flatten()
+        if config.divide_by_pi:
+            told = told / math.pi
+        if step is not None:
+            epoch = step // max(len(self.subject.times), 1)
+            dropped = _hash01(step) < config.drop
+            if step < config.zero_until or dropped or (config.zero_every and epoch % config.zero_every == 0):
+                told = torch.zeros_like(told)
+        return told
+
+    def _shell(self, body: PosedBody, time: int | None, training: bool) -> Shell:
+        sampler = self.config.sampler
+        radius, voxel = (sampler.radius, sampler.voxel) if isinstance(sampler, ShellSampler) else (0.1, 0.03)
+        row = self.refinement.rows.get(time) if training and time is not None else None
+        if row is None:
+            return build_shell(body.vertices, body.faces, radius, voxel)
+        if row not in self._shells:
+            with torch.no_grad():
+                start = pose_body(self._shape(), self.shell_poses[row], self.shell_translations[row])
+            self._shells[row] = build_shell(start.vertices, body.faces, radius, voxel)
+        return self._shells[row]
+
+    # -- rendering -----------------------------------------------------------------------------------------------------
+
+    def render(
+        self, rays: Rays, posed: PosedAvatar, background: Float[Tensor, "3"], generator: torch.Generator | None = None
+    ) -> Rendering:
+        """See `Avatar.render`."""
+        samples, nearest, shares, outlier = self._place(rays, posed, generator)
+        if len(samples) == 0:
+            return _nothing(len(rays), background)
+        x_canonical, to_observation = to_canonical(samples.points(rays), nearest, shares, posed.forward)
+        answer = self.field(x_canonical, posed.condition, to_observation)
+        normals = F.normalize((to_observation * answer.gradient[:, None]).sum(-1), dim=-1)
+        whole = self._composite(answer, normals, samples, outlier, background, len(rays))
+        if answer.base is None:
+            return whole
+        # The base picture's normals are its own branch's, at the same samples.
+        base_normals = F.normalize((to_observation * answer.base.gradient[:, None]).sum(-1), dim=-1)
+        base = self._composite(answer.base, base_normals, samples, outlier, background, len(rays))
+        return Rendering(whole.color, whole.opacity, whole.depth, whole.normal, base)
+
+    def _composite(
+        self, answer: FieldOutput, normals: Tensor, samples: Samples, outlier: Tensor, background: Tensor, rays: int
+    ) -> Rendering:
+        sdf = torch.where(outlier, 4.0, answer.sdf)
+        scaled = Samples(samples.ray_index, samples.depth, samples.delta * self.scale)
+        weights = composite_weights(laplace_density(sdf, self.beta), scaled)
+        ones = torch.ones_like(sdf)[:, None]
+        values = torch.cat([answer.color, ones, samples.depth[:, None], normals.detach()], -1)
+        out = composite(weights, values, samples, rays)
+        opacity = out[:, 3]
+        depth = out[:, 4] / opacity.detach().clamp_min(1e-6)
+        return Rendering(out[:, :3] + (1 - opacity[:, None]) * background, opacity, depth, out[:, 5:8])
+
+    def _place(
+        self, rays: Rays, posed: PosedAvatar, generator: torch.Generator | None
+    ) -> tuple[Samples, Tensor, Tensor, Tensor]:
+        """Samples, their nearest vertices and shares, and whether each is too far from the body to count."""
+        sampler, k = self.config.sampler, self.config.neighbours
+        if isinstance(sampler, ErrorBoundedSampler):
+            return self._place_error_bounded(sampler, rays, posed, generator)
+        samples, rows = sample_shell(posed.shell, rays, sampler.step, generator)
+        points = samples.points(rays).detach()
+        nearest, squared = nearest_vertices(posed.shell, points, rows, k)
+        near = squared[:, 0] < min(sampler.radius, self.config.outlier_distance / self.scale) ** 2
+        samples, nearest, squared, points = samples[near], nearest[near], squared[near], points[near]
+        shares = neighbour_weights(squared)
+        if sampler.least_weight > 0 and len(samples):
+            with torch.no_grad():
+                x_canonical, _ = to_canonical(points, nearest, shares, posed.forward)
+                sdf = self.field.sdf(x_canonical, posed.condition)
+                weights = composite_weights(laplace_density(sdf, self.beta), samples)
+                seen = weights > sampler.least_weight
+            samples, nearest, shares = samples[seen], nearest[seen], shares[seen]
+        return samples, nearest, shares, torch.zeros(len(samples), dtype=torch.bool, device=points.device)
+
+    def _place_error_bounded(
+        self, sampler: ErrorBoundedSampler, rays: Rays, posed: PosedAvatar, generator: torch.Generator | None
+    ) -> tuple[Samples, Tensor, Tensor, Tensor]:
+        margin = 0.31
+        low, high = posed.body.joints.detach().amin(0) - margin, posed.body.joints.detach().amax(0) + margin
+        clipped, hit = clip_to_box(rays, low, high)
+        inside = hit.nonzero()[:, 0]
+        tree = cKDTree(posed.body.vertices.detach().cpu().numpy())
+        limit = self.config.outlier_distance / self.scale
+
+        def neighbours(points: Tensor) -> tuple[Tensor, Tensor]:
+            distance, index = tree.query(points.detach().cpu().numpy(), k=self.config.neighbours, workers=-1)
+            found = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), -1))
+            apart = torch.from_numpy(np.asarray(distance, dtype=np.float32).reshape(len(points), -1))
+            return found.to(points.device), apart.to(points.device)
+
+        def sdf(points: Tensor) -> Tensor:
+            index, apart = neighbours(points)
+            x_canonical, _ = to_canonical(points, index, neighbour_weights(apart**2), posed.forward.detach())
+            value = self.field.sdf(x_canonical, posed.condition)
+            # The release treats outliers as empty only when it does not train.
+            return value if generator is not None else torch.where(apart[:, 0] > limit, 4.0, value)
+
+        with torch.no_grad():
+            samples = sampler.sample(clipped[inside], sdf, self.beta, generator, generator is not None)
+        samples = Samples(inside[samples.ray_index], samples.depth, samples.delta)
+        index, apart = neighbours(samples.points(rays))
+        outlier = (apart[:, 0] > limit) & self.config.outliers_in_shading & (generator is None)
+        return samples, index, neighbour_weights(apart**2), outlier
+
+    # -- losses --------------------------------------------------------------------------------------------------------
+
+    def losses(
+        self, rendering: Rendering, batch: Batch, posed: PosedAvatar, step: int, generator: torch.Generator
+    ) -> dict[str, Float[Tensor, ""]]:
+        """See `Avatar.losses`."""
+        config = self.config.losses
+        terms: dict[str, Tensor] = {}
+        terms["reconstruction"] = losses.reconstruction(rendering.color, batch.color, config.reduction)
+        if config.common and rendering.base is not None:
+            terms["common"] = losses.common(rendering.base.color, batch.color, config.reduction)
+        if config.eikonal:
+            terms["eikonal"] = losses.eikonal(self._eikonal_gradients(posed, generator))
+        if config.mask:
+            terms["mask"] = losses.mask(rendering.opacity, batch.mask, config.mask_form)
+        if config.s3im and batch.singles:
+            singles = slice(0, batch.singles)
+            terms["s3im"] = losses.s3im(rendering.color[singles], batch.color[singles], generator)
+        if config.lpips and self.lpips is not None and step >= config.lpips_start and len(batch.patch_pixels):
+            terms["lpips"] = self.lpips(_patches(rendering.color, batch), _patches(batch.color, batch)).mean()
+        return {name: getattr(config, name) * term for name, term in terms.items()}
+
+    def _eikonal_gradients(self, posed: PosedAvatar, generator: torch.Generator) -> Tensor:
+        config, points = self.config.losses, self.canonical_points
+        which = torch.randint(len(points), (config.eikonal_points,), generator=generator, device=generator.device)
+        moved = torch.randn(config.eikonal_points, 3, generator=generator, device=generator.device)
+        x = points[which.to(self.device)] + config.eikonal_spread * moved.to(self.device)
+        return self.field.distance_and_gradient(x, posed.condition)[1]
+
+    def level(
+        self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full"
+    ) -> Float[Tensor, "S"]:
+        """See `Avatar.level`."""
+        if branch == "base":
+            answer = self.field(x_canonical, posed.condition, None)
+            return (answer.base or answer).sdf
+        return self.field.sdf(x_canonical, posed.condition)
+
+
+_BETA_UNIT = 0.01
+"""Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""
+
+
+def _inverse_softplus(value: float) -> float:
+    return value if value > 30 else math.log(math.expm1(value))
+
+
+def _hash01(step: int) -> float:
+    """A fixed number in 0..1 for each step, so that a resumed run makes the same choices."""
+    return ((step * 2654435761 + 12345) % 4294967296) / 4294967296
+
+
+def _nothing(rays: int, background: Tensor) -> Rendering:
+    zero = torch.zeros(rays, device=background.device)
+    return Rendering(background.expand(rays, 3), zero, zero, zero[:, None].expand(rays, 3))
+
+
+def _patches(color: Tensor, batch: Batch) -> Tensor:
+    """Patch images [patches 3 P P]; pixels without a ray are black in both pictures."""
+    padded = torch.cat([color, torch.zeros_like(color[:1])])
+    return padded[batch.patch_pixels].permute(0, 3, 1, 2)

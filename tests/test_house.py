@@ -1,0 +1,116 @@
+"""The rules of the house: floors, equations, shapes, sizes, docstrings."""
+
+import ast
+import functools
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import citations
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+
+from twofold.geometry.cameras import Rays
+from twofold.geometry.rotations import axis_angle_to_matrix
+
+ROOT = Path(__file__).resolve().parents[1]
+CODE = sorted(file for folder in ("src", "tests", "docs/hooks", "benchmarks") for file in (ROOT / folder).rglob("*.py"))
+TEXTS = CODE + [
+    file
+    for folder in (".", ".ci", "docs")
+    for file in sorted((ROOT / folder).iterdir())
+    if file.is_file() and file.suffix in {".md", ".toml", ".yml", ".yaml", ".txt", ".html", ".css", ""}
+]
+
+
+def module_names() -> list[str]:
+    return sorted(citations.modules())
+
+
+def test_files_import_only_from_lower_floors():
+    program = Path(sys.executable).with_name("lint-imports")
+    done = subprocess.run([program, "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
+
+
+def test_each_equation_is_cited_by_exactly_one_function():
+    cited = [(c.number, c.name) for c in citations.citations()]
+    assert [number for number, _ in cited] == list(range(1, 13)), cited
+
+
+def test_equations_are_cited_nowhere_but_in_docstrings_of_functions():
+    in_text = sum(
+        len(match[1].split(", ")) for file in CODE if "src" in file.parts for match in citations.CITATION.finditer(file.read_text())
+    )
+    assert in_text == len(citations.citations())
+
+
+def test_equation_table_has_a_linked_row_for_each_citation(tmp_path):
+    folder = tmp_path / "twofold"
+    folder.mkdir()
+    text = 'def encode():\n    """Octaves (Eqs. 2, 4)."""\n\n\nclass Field:\n    def combine(self):\n        """Both (Eq. 6)."""\n'
+    (folder / "field.py").write_text(text)
+    rows = citations.equation_table(tmp_path).splitlines()[2:]
+    assert [row.split(" | ")[0].strip("| ") for row in rows] == ["2", "4", "6"]
+    assert rows[2].endswith("[`field.Field.combine`][twofold.field.Field.combine] |")
+
+
+def test_wrong_shape_of_an_argument_raises():
+    axis_angle_to_matrix(torch.zeros(2, 3))
+    with pytest.raises(TypeCheckError):
+        axis_angle_to_matrix(torch.zeros(2, 4))
+
+
+def test_shapes_of_a_dataclass_that_disagree_raise():
+    with pytest.raises(TypeCheckError):
+        Rays(torch.zeros(5, 3), torch.zeros(5, 3), torch.zeros(5), torch.zeros(4))
+
+
+@pytest.mark.parametrize("name", [name for name in module_names() if not name.endswith("__init__")])
+def test_public_functions_say_what_they_do(name):
+    silent = [
+        full
+        for full, node in citations.functions(ast.parse(citations.modules()[name].read_text()), name)
+        if "._" not in full and not ast.get_docstring(node) and not is_overload(node)
+    ]
+    assert not silent
+
+
+def is_overload(node):
+    return any(ast.unparse(decorator).endswith("overload") for decorator in node.decorator_list)
+
+
+def test_no_file_is_longer_than_400_lines():
+    lengths = {str(file.relative_to(ROOT)): len(file.read_text().splitlines()) for file in CODE}
+    assert not {name: length for name, length in lengths.items() if length > 400}
+
+
+def test_no_file_names_a_folder_of_one_machine():
+    folders = "|".join(["work", "root", "home", "Users", "opt", "tmp"])
+    pattern = re.compile(rf"(?<![\w.*~-])/(?:{folders})/\w")
+    found = [f"{file.relative_to(ROOT)}: {m[0]}" for file in TEXTS for m in pattern.finditer(file.read_text())]
+    assert not found
+
+
+def test_nothing_is_unpickled_through_numpy():
+    guilty = [
+        f"{file.relative_to(ROOT)}:{node.value.lineno}"
+        for file in CODE
+        if "src" in file.parts
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.keyword) and node.arg == "allow_pickle" and ast.unparse(node.value) != "False"
+    ]
+    assert not guilty
+
+
+def test_options_in_the_paper_page_exist():
+    text = (ROOT / "docs" / "paper.md").read_text()
+    keys = set(re.findall(r"`method\.([\w.]+?)[`=]", text)) | set(re.findall(r" method\.([\w.]+?)=", text))
+    assert len(keys) > 30
+    from twofold.methods.factorized import FactorizedConfig
+
+    default = FactorizedConfig()
+    for key in sorted(keys):
+        functools.reduce(getattr, key.split("."), default)
