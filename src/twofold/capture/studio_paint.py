@@ -26,7 +26,7 @@ class Paint:
 
 
 def linear(color: Color) -> Float[np.ndarray, "3"]:
-    """sRGB to linear light."""
+    """SRGB to linear light."""
     c = np.asarray(color, np.float32)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
@@ -43,7 +43,7 @@ def paint(points: Float[np.ndarray, "n 3"], layer: Int[np.ndarray, "n"], anatomy
     color = np.zeros((len(points), 3), np.float32)
     gloss = np.zeros(len(points), np.float32)
     painters = {SKIN: _skin, SHIRT: _shirt, TROUSERS: _trousers, SHOES: _shoes, SOLES: _soles, HAIR: _hair}
-    glosses = {SKIN: 0.10, SHIRT: 0.0, TROUSERS: 0.0, SHOES: 0.12, SOLES: 0.03, HAIR: 0.22}
+    glosses = {SKIN: 0.10, SHIRT: 0.0, TROUSERS: 0.0, SHOES: 0.12, SOLES: 0.03, HAIR: 0.07}
     for which, painter in painters.items():
         chosen = np.nonzero(layer == which)[0]
         if len(chosen):
@@ -65,7 +65,9 @@ def _grain(p: np.ndarray, size: float) -> np.ndarray:
     """Irregular mottling of about `size` metres, between -1 and 1."""
     q = p * (2 * np.pi / size)
     x, y, z = q.T
-    return (np.sin(x + 1.7 * np.sin(0.7 * y)) + np.sin(y + 1.3 * np.sin(0.8 * z)) + np.sin(z + 1.9 * np.sin(0.6 * x))) / 3
+    return (
+        np.sin(x + 1.7 * np.sin(0.7 * y)) + np.sin(y + 1.3 * np.sin(0.8 * z)) + np.sin(z + 1.9 * np.sin(0.6 * x))
+    ) / 3
 
 
 def _skin(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
@@ -99,8 +101,9 @@ def _face(p: np.ndarray, color: np.ndarray, a: Anatomy, look: Look) -> np.ndarra
     inside = (ax < half) & (np.abs(mouth) < 0.145 * bow)
     color = _mix(color, lips, 0.85 * inside)
     color = _mix(color, 0.25 * lips, 0.9 * _line(mouth, 0.035) * (ax < half + 0.03))
-    arch = y - 0.33 - 0.10 * np.sin((ax - 0.15) * 2.6).clip(0) + 0.05 * (ax > 0.6) * (ax - 0.6)
-    brow = _line(arch, 0.13) * smoothstep(0.17, 0.24, ax) * smoothstep(0.88, 0.70, ax)
+    arch = y - 0.36 - 0.10 * np.sin((ax - 0.15) * 2.6).clip(0)
+    brow = 1 - smoothstep(0.6, 1.0, 2 * np.abs(arch) / (0.15 * smoothstep(0.95, 0.5, ax) + 0.02))
+    brow = brow * smoothstep(0.15, 0.24, ax) * (ax < 0.92)
     color = _mix(color, 0.8 * hair, 0.85 * brow)
     for eye in a.eyes:
         ex, ey = ((p[:, :2] - eye[:2]) / a.spread).T
@@ -163,7 +166,9 @@ def _shirt(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
         color = _mix(color, first * 0.45, front * _line(pocket, 0.006))
         spot = np.hypot(x, ((y - a.crotch) % 0.075) - 0.0375)
         color = _mix(color, np.float32([[0.75, 0.72, 0.65]]), (front & (spot < 0.0075)).astype(np.float32))
-        color = _mix(color, np.float32([[0.1, 0.09, 0.08]]), (front & (np.abs(spot - 0.0085) < 0.0015)).astype(np.float32))
+        color = _mix(
+            color, np.float32([[0.1, 0.09, 0.08]]), (front & (np.abs(spot - 0.0085) < 0.0015)).astype(np.float32)
+        )
         color = _mix(color, second, 0.8 * collar)
     else:
         chest = y - j[9, 1] - 0.02
@@ -194,7 +199,18 @@ def _emblem(x: np.ndarray, y: np.ndarray, which: int) -> np.ndarray:
     return bolt | (np.abs(r - 0.08) < 0.009)
 
 
-_SEGMENTS = (0b1110111, 0b0010010, 0b1011101, 0b1011011, 0b0111010, 0b1101011, 0b1101111, 0b1010010, 0b1111111, 0b1111011)
+_SEGMENTS = (
+    0b1110111,
+    0b0010010,
+    0b1011101,
+    0b1011011,
+    0b0111010,
+    0b1101011,
+    0b1101111,
+    0b1010010,
+    0b1111111,
+    0b1111011,
+)
 """Seven-segment digits; bits from the highest: top, upper left, upper right, middle, lower left, lower right, bottom."""
 
 
@@ -245,7 +261,9 @@ def _shoes(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
     laces = (np.abs(across) < 0.028) & (ahead > 0.045) & (ahead < 0.135) & (height > 0.035)
     color = _mix(color, base * 0.55, laces)
     color = _mix(color, np.float32([[0.85, 0.85, 0.83]]), laces & ((ahead / 0.018) % 1 < 0.45))
-    stripe = (np.abs(across) > 0.03) & (np.abs(ahead - 0.02 - 0.6 * height) % 0.035 < 0.012) & (np.abs(ahead - 0.05) < 0.05)
+    stripe = (
+        (np.abs(across) > 0.03) & (np.abs(ahead - 0.02 - 0.6 * height) % 0.035 < 0.012) & (np.abs(ahead - 0.05) < 0.05)
+    )
     color = _mix(color, trim, stripe & (height < 0.075))
     return _mix(color, 0.3 * base, (height > 0.082).astype(np.float32) * 0.0)
 

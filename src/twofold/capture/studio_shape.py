@@ -4,6 +4,7 @@ Every layer is a signed distance (negative inside, metres) built from the body's
 lies hidden under cloth, hems are closed lips, and the mesh is exactly the surface that a camera sees.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,11 +12,15 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage, sparse
+from scipy.interpolate import PchipInterpolator
 from scipy.spatial import cKDTree
-from skimage.measure import label, marching_cubes
+from skimage.measure import marching_cubes
 
 from twofold.body.skeleton import ShapedBody, pose_body
 from twofold.capture.studio_look import Look
+from twofold.geometry.cameras import Camera
+from twofold.geometry.raster import rasterize
+from twofold.geometry.rotations import axis_angle_to_matrix, rigid_transform
 from twofold.geometry.surfaces import split_edges, vertex_normals
 
 SKIN, SHIRT, TROUSERS, SHOES, SOLES, HAIR = range(6)
@@ -74,12 +79,10 @@ def survey(shaped: ShapedBody) -> Anatomy:
     posed = pose_body(shaped, torch.zeros(24, 3), torch.zeros(3))
     faces, eyes = _outer_parts(shaped)
     canonical = posed.canonical_vertices
+    faces = faces[_seen_from_outside(canonical, faces, float(shaped.joints[12, 1]))]
     normals = vertex_normals(canonical, faces)
     dense, dense_faces, parents = split_edges(canonical, faces, torch.ones(len(canonical), dtype=torch.bool))
     used = torch.unique(dense_faces)
-    # The hollows behind the eyeballs would turn the surface inside out there.
-    for eye in torch.from_numpy(eyes):
-        used = used[((dense[used] - eye).norm(dim=-1) > 0.018) | (dense[used, 2] > eye[2] + 0.004)]
     dense_normals = normals[parents].mean(1)
     dense_normals = dense_normals / dense_normals.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     rest_joints = shaped.joints.numpy()
@@ -122,6 +125,30 @@ def _outer_parts(shaped: ShapedBody) -> tuple[torch.Tensor, Float[np.ndarray, "2
     return torch.from_numpy(faces[kept[faces[:, 0]]]), np.stack(eyes)
 
 
+def _seen_from_outside(
+    vertices: Float[torch.Tensor, "V 3"], faces: Int[torch.Tensor, "F 3"], above: float
+) -> Bool[torch.Tensor, "F"]:
+    """All faces of the body, but of the head only those in view: no eye sockets, no mouth, no nostrils.
+
+    Args:
+        vertices: canonical.
+        faces: of the body and its eyeballs.
+        above: height of the neck, where the head begins.
+    """
+    seen = vertices[faces[:, 0], 1] < above
+    head = vertices[vertices[:, 1] > above]
+    center, size, distance = 0.5 * (head.amin(0) + head.amax(0)), 256, 2.0
+    focal = 0.5 * size * distance / 0.17
+    intrinsics = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    for turn, tilt in [(t * math.pi / 4, 0.0) for t in range(8)] + [(0.0, 0.6), (0.0, -0.7), (2.0, 1.2), (-2.0, 1.2)]:
+        rotation = axis_angle_to_matrix(torch.tensor([math.pi + tilt, 0.0, 0.0])) @ axis_angle_to_matrix(
+            torch.tensor([0.0, turn, 0.0])
+        )
+        view = rigid_transform(rotation, torch.tensor([0.0, 0.0, distance]) - rotation @ center)
+        seen[rasterize(Camera(view, intrinsics, size, size), vertices, faces, cull=True).face] = True
+    return seen
+
+
 def build_figure(shaped: ShapedBody, look: Look) -> Figure:
     """Dress a body.
 
@@ -138,7 +165,9 @@ def build_figure(shaped: ShapedBody, look: Look) -> Figure:
     exact, shift = _rough_distance(low, shape, anatomy, tree)
     blurred = [ndimage.gaussian_filter(exact, sigma / COARSE, mode="nearest") for sigma in (0.008, 0.016, 0.024)]
     blurred += [ndimage.gaussian_filter(shift[..., axis], 0.02 / COARSE, mode="nearest") for axis in range(3)]
-    coarse = dress(nodes + np.stack([s.ravel() for s in blurred[3:]], -1), [f.ravel() for f in blurred[:3]], anatomy, look)
+    coarse = dress(
+        nodes + np.stack([s.ravel() for s in blurred[3:]], -1), [f.ravel() for f in blurred[:3]], anatomy, look
+    )
     nearest = np.minimum(coarse.min(1), exact.ravel()).reshape(shape)
     splines = [ndimage.spline_filter(field, order=3, output=np.float32) for field in blurred]
 
@@ -155,7 +184,7 @@ def build_figure(shaped: ShapedBody, look: Look) -> Figure:
         return layers, rest
 
     vertices, faces = _mesh_union(nearest, low, evaluate)
-    vertices, faces = _refine_bare_skin(vertices, faces, evaluate, anatomy)
+    vertices, faces = _refine_ends(vertices, faces, evaluate, anatomy)
     layers, rest = evaluate(vertices)
     normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
     weights = _skinning_weights(vertices, faces, layers, anatomy, tree)
@@ -262,9 +291,7 @@ def _shirt(points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy: An
     return np.maximum.reduce([base, np.abs(points[:, 0]) - end, hem - y, neck])
 
 
-def _trousers(
-    points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy: Anatomy, look: Look
-) -> np.ndarray:
+def _trousers(points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy: Anatomy, look: Look) -> np.ndarray:
     reach = leg_reach(points, anatomy)
     flare = smoothstep(0.3, 2.0, reach) if look.trouser > 1 else 1.6 * smoothstep(0.2, 0.9, reach)
     base = np.minimum(loose - 0.009 - 0.010 * flare, tight - 0.005)
@@ -274,7 +301,9 @@ def _trousers(
     return np.maximum.reduce([base, end - points[:, 1], waist])
 
 
-def _shoes(points: np.ndarray, tight: np.ndarray, round_: np.ndarray, anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
+def _shoes(
+    points: np.ndarray, tight: np.ndarray, round_: np.ndarray, anatomy: Anatomy
+) -> tuple[np.ndarray, np.ndarray]:
     """The upper, rounded over the toes, and the sole under its outline."""
     ankle, floor = anatomy.joints[7], anatomy.floor
     height = points[:, 1] - floor
@@ -292,9 +321,9 @@ def _shoes(points: np.ndarray, tight: np.ndarray, round_: np.ndarray, anatomy: A
 
 
 _HAIRLINES = {
-    "short": ((0.0, 0.55, 0.95, 1.2, 1.45, 1.9, 3.15), (1.02, 0.85, 0.35, -0.25, 0.5, -0.3, -1.25)),
-    "curtain": ((0.0, 0.5, 0.85, 1.05, 1.5, 3.15), (1.02, 0.80, 0.1, -1.25, -1.6, -1.75)),
-    "beanie": ((0.0, 0.9, 1.6, 3.15), (0.72, 0.55, 0.35, 0.0)),
+    "short": ((0.0, 0.5, 0.85, 1.1, 1.3, 1.5, 1.75, 2.1, 3.2), (1.05, 0.95, 0.62, 0.0, 0.05, 0.45, 0.35, -0.5, -1.2)),
+    "curtain": ((0.0, 0.45, 0.75, 0.95, 1.5, 3.2), (1.05, 0.85, 0.2, -1.1, -1.6, -1.75)),
+    "beanie": ((0.0, 0.9, 1.6, 3.2), (0.72, 0.55, 0.35, 0.0)),
 }
 """Height of the hairline above the eyes, in eye distances, over the angle from the front."""
 
@@ -307,17 +336,23 @@ def _hair(points: np.ndarray, round_: np.ndarray, anatomy: Anatomy, look: Look) 
     p = points[near] - np.array([0, eyes[1], 0.5 * (eyes[2] + head[2]) - 0.4 * unit], np.float32)
     angle = np.arctan2(np.abs(p[:, 0]), p[:, 2])
     style = look.hair if look.hair == "beanie" else "curtain" if look.hair == "bob" else "short"
-    line = np.interp(angle, *_HAIRLINES[style]) * unit
+    line = (PchipInterpolator(*_HAIRLINES[style])(angle) * unit).astype(np.float32)
     above = p[:, 1] - line
     top = smoothstep(0.5 * unit, 2.0 * unit, p[:, 1])
-    depth = {"crop": 0.010, "quiff": 0.012, "bob": 0.022, "bun": 0.010, "ponytail": 0.010, "curls": 0.026, "beanie": 0.014}
+    depth = {
+        "crop": 0.010,
+        "quiff": 0.012,
+        "bob": 0.022,
+        "bun": 0.010,
+        "ponytail": 0.010,
+        "curls": 0.026,
+        "beanie": 0.014,
+    }
     thickness = np.full(len(p), depth[look.hair])
     if look.hair == "quiff":
         thickness += 0.028 * top * smoothstep(-0.6 * unit, 1.0 * unit, p[:, 2])
     if look.hair == "curls":
         thickness += 0.006 * np.sin(p * 190).sum(1) / 1.7 + 0.008 * top
-    elif look.hair != "beanie":
-        thickness += 0.0016 * np.sin(angle * 26 + p[:, 1] * 60)
     taper = 0.35 + 0.65 * smoothstep(0.0, 0.022, above) if style != "beanie" else np.ones(len(p))
     shell = np.maximum(round_[near] - 0.004 - thickness * taper, -0.8 * above)
     if look.hair == "bun":
@@ -333,7 +368,9 @@ def _tail(p: np.ndarray) -> np.ndarray:
     bends = np.array([[0, 0.9, -1.55], [0, 0.7, -2.25], [0, -0.6, -2.55], [0, -1.9, -2.3]])
     radii = (0.3, 0.5, 0.45, 0.12)
     best = np.full(len(p), 9.0)
-    for (a, b), (ra, rb) in zip(zip(bends[:-1], bends[1:], strict=True), zip(radii[:-1], radii[1:], strict=True), strict=True):
+    for (a, b), (ra, rb) in zip(
+        zip(bends[:-1], bends[1:], strict=True), zip(radii[:-1], radii[1:], strict=True), strict=True
+    ):
         along = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
         best = np.minimum(best, np.linalg.norm(p - a - along[:, None] * (b - a), axis=1) - ra - along * (rb - ra))
     return best
@@ -355,19 +392,15 @@ def _mesh_union(nearest, low, evaluate):  # noqa
     return vertices[kept], (np.cumsum(kept) - 1)[faces[kept[faces[:, 0]]]]
 
 
-def _refine_bare_skin(vertices, faces, evaluate, anatomy):  # noqa
-    """Halve the triangles of face and hands and draw them onto the body, which has finer features than the grid."""
-    head = vertices[:, 1] > anatomy.joints[12, 1]
-    hands = np.abs(vertices[:, 0]) > abs(anatomy.joints[20, 0])
-    fine = head | hands
-    fine[fine] = evaluate(vertices[fine])[0].argmin(1) == SKIN
+def _refine_ends(vertices, faces, evaluate, anatomy):  # noqa
+    """Halve the triangles of head and hands and draw them onto the layers, which have finer features than the grid."""
+    fine = (vertices[:, 1] > anatomy.joints[12, 1]) | (np.abs(vertices[:, 0]) > abs(anatomy.joints[20, 0]) - 0.01)
     moved, finer, parents = split_edges(*(torch.from_numpy(a) for a in (vertices, faces, fine)))
     vertices, faces = moved.numpy(), finer.numpy()
     fine = fine[parents.numpy()].all(1)
     for _ in range(2):
         normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
-        here = evaluate(vertices[fine])[0]
-        step = np.clip(here[:, SKIN], -0.003, 0.003) * (here.argmin(1) == SKIN)
+        step = np.clip(evaluate(vertices[fine])[0].min(1), -0.003, 0.003)
         vertices[fine] -= 0.8 * step[:, None] * normals[fine]
     return vertices, faces
 
