@@ -22,8 +22,9 @@ def reconstruction(
 ) -> Float[Tensor, ""]:
     """Absolute difference of rendered and true colours (Eq. 9).
 
-    >>> reconstruction(torch.zeros(2, 3), torch.full((2, 3), 0.5)), reconstruction(torch.zeros(2, 3), torch.ones(2, 3), "sum")
-    (tensor(0.5000), tensor(6.))
+    >>> black, grey = torch.zeros(2, 3), torch.full((2, 3), 0.5)
+    >>> reconstruction(black, grey), reconstruction(black, grey, "sum")
+    (tensor(0.5000), tensor(3.))
 
     Args:
         color: rendered, 0..1.
@@ -90,9 +91,10 @@ def mask(
         form: "sides" adds the mean over the inside and the mean over the outside, as released, so that the smaller
             side weighs as much as the larger; "mean" is the mean over all rays.
     """
+    difference = (opacity - coverage).abs()
     if form == "mean":
-        return (opacity - coverage).abs().mean()
-    return _mean_over((1 - opacity).abs(), coverage) + _mean_over(opacity.abs(), 1 - coverage)
+        return difference.mean()
+    return _mean_over(difference, coverage) + _mean_over(difference, 1 - coverage)
 
 
 def s3im(color: Float[Tensor, "R 3"], truth: Float[Tensor, "R 3"], generator: torch.Generator) -> Float[Tensor, ""]:

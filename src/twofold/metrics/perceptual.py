@@ -144,11 +144,11 @@ def _fill(file: Path, wanted: dict[str, Tensor], what: str) -> None:
         raise TwofoldError(f"{file} cannot be read as {what}; download it again.") from error
     for name, parameter in wanted.items():
         found = stored.get(name) if isinstance(stored, dict) else None
-        if not isinstance(found, Tensor) or found.numel() != parameter.numel():
-            shape = tuple(found.shape) if isinstance(found, Tensor) else "nothing"
+        if not isinstance(found, Tensor) or found.squeeze().shape != parameter.shape:
+            has = f"of shape {tuple(found.shape)}" if isinstance(found, Tensor) else "missing"
             raise TwofoldError(
-                f"{file} should be {what}, with {name} of {parameter.numel()} numbers, it has {shape}; "
-                "download it again."
+                f"{file} should be {what}, but {name} is {has}, not of shape {tuple(parameter.shape)}; "
+                "put the right file there."
             )
         with torch.no_grad():
             parameter.copy_(found.reshape(parameter.shape))

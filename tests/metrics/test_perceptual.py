@@ -1,0 +1,165 @@
+import pytest
+import torch
+from torch.nn import functional as F
+
+from twofold.errors import TwofoldError
+from twofold.metrics.perceptual import (
+    LINEAR_FILE,
+    LPIPS,
+    VGG_FILE,
+    load_lpips,
+    weights_folder,
+    weights_hint,
+)
+
+NUMBERS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
+"""Convolutions in torchvision's list of VGG16's layers."""
+CHANNELS = (64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)
+POOLINGS = (4, 9, 16, 23)
+ENDS = (3, 8, 15, 22, 29)
+"""Layers after which features are compared: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3."""
+
+
+@pytest.fixture(scope="module")
+def published():
+    """Both files' contents, with random numbers in the real layers' shapes."""
+    generator = torch.Generator().manual_seed(0)
+    vgg, inputs = {}, 3
+    for number, outputs in zip(NUMBERS, CHANNELS, strict=True):
+        spread = (2 / (9 * inputs)) ** 0.5
+        vgg[f"features.{number}.weight"] = spread * torch.randn(outputs, inputs, 3, 3, generator=generator)
+        vgg[f"features.{number}.bias"] = 0.1 * torch.randn(outputs, generator=generator)
+        inputs = outputs
+    vgg["classifier.0.weight"] = torch.zeros(2, 2)
+    sizes = (64, 128, 256, 512, 512)
+    linear = {f"lin{i}.model.1.weight": torch.rand(1, n, 1, 1, generator=generator) for i, n in enumerate(sizes)}
+    return vgg, linear
+
+
+@pytest.fixture(scope="module")
+def folder(published, tmp_path_factory):
+    """Both files as they are published; torchvision's is in the format from before torch 1.6."""
+    folder = tmp_path_factory.mktemp("weights")
+    torch.save(published[0], folder / VGG_FILE, _use_new_zipfile_serialization=False)  # noqa: TID251
+    torch.save(published[1], folder / LINEAR_FILE)  # noqa: TID251
+    return folder
+
+
+def literal_lpips(first, second, vgg, linear):
+    """Layer by layer through torchvision's numbering, one picture at a time."""
+
+    def features(picture):
+        shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+        x = ((2 * picture - 1) - shift[:, None, None]) / scale[:, None, None]
+        x, found = x[None], []
+        for number in range(30):
+            if number in NUMBERS:
+                x = F.conv2d(x, vgg[f"features.{number}.weight"], vgg[f"features.{number}.bias"], padding=1)
+            elif number in POOLINGS:
+                x = F.max_pool2d(x, kernel_size=2, stride=2)
+            else:
+                x = x.clamp_min(0)
+            if number in ENDS:
+                found.append(x[0] / (x[0].square().sum(0).sqrt() + 1e-10))
+        return found
+
+    total = 0.0
+    for i, (a, b) in enumerate(zip(features(first), features(second), strict=True)):
+        total += F.conv2d((a - b)[None].square(), linear[f"lin{i}.model.1.weight"]).mean().item()
+    return total
+
+
+def test_distance_is_the_layer_by_layer_reference(published, folder):
+    model = load_lpips(folder)
+    first, second = torch.rand(2, 3, 24, 20), torch.rand(2, 3, 24, 20)
+    found = model(first, second)
+    for i in range(2):
+        assert found[i].item() == pytest.approx(literal_lpips(first[i], second[i], *published), rel=1e-4)
+
+
+def small():
+    model = LPIPS(((4,), (4, 6), (6,), (8,), (8,)))
+    generator = torch.Generator().manual_seed(1)
+    for parameter in [*model.blocks.parameters(), *model.linear.parameters()]:
+        parameter.copy_(0.3 * torch.randn(parameter.shape, generator=generator).abs())
+    return model
+
+
+def test_distance_is_symmetric_and_zero_only_for_equal_pictures():
+    model, first, second = small(), torch.rand(3, 3, 16, 16), torch.rand(3, 3, 16, 16)
+    torch.testing.assert_close(model(first, second), model(second, first))
+    assert (model(first, second) > 0).all()
+    assert (model(first, first) == 0).all()
+
+
+def test_gradients_reach_the_pictures_and_not_the_weights():
+    model = small().double()
+    first, second = torch.rand(1, 3, 16, 16, dtype=torch.float64).requires_grad_(), torch.rand(1, 3, 16, 16).double()
+    model(first, second).sum().backward()
+    assert first.grad.abs().sum() > 0
+    assert all(not p.requires_grad for p in model.parameters())
+
+
+def test_black_pictures_have_finite_gradients():
+    model = small()
+    for convolution in model.blocks.modules():
+        if isinstance(convolution, torch.nn.Conv2d):
+            convolution.bias.fill_(-100.0)
+    first = torch.zeros(1, 3, 16, 16, requires_grad=True)
+    model(first, torch.zeros(1, 3, 16, 16)).sum().backward()
+    assert first.grad.isfinite().all()
+
+
+def test_small_pictures_are_refused():
+    with pytest.raises(ValueError, match="16 x 16"):
+        small()(torch.zeros(1, 3, 8, 32), torch.zeros(1, 3, 8, 32))
+
+
+def test_absent_files_give_none_and_a_hint_that_names_them(tmp_path):
+    assert load_lpips(tmp_path) is None
+    hint = weights_hint(tmp_path)
+    assert all(word in hint for word in (str(tmp_path), VGG_FILE, LINEAR_FILE, "TWOFOLD_WEIGHTS"))
+    assert "\n" not in hint
+
+
+def test_folder_follows_the_environment(monkeypatch, tmp_path):
+    monkeypatch.setenv("TWOFOLD_WEIGHTS", str(tmp_path / "mine"))
+    assert weights_folder() == tmp_path / "mine"
+    monkeypatch.delenv("TWOFOLD_WEIGHTS")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert weights_folder() == tmp_path / "twofold" / "weights"
+
+
+class Trap:
+    """What a file of code looks like: unpickling it would raise the alarm."""
+
+    def __reduce__(self):
+        return (pytest.fail, ("code was run",))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "cannot be read as torchvision's VGG16"),
+        (Trap(), "cannot be read as torchvision's VGG16"),
+        ({"features.0.weight": torch.zeros(1)}, r"features.0.weight is of shape \(1,\), not of shape \(64, 3, 3, 3\)"),
+        ({"other": torch.zeros(1)}, "features.0.weight is missing"),
+        ([torch.zeros(1)], "features.0.weight is missing"),
+    ],
+    ids=["damaged", "code", "wrong size", "wrong names", "no names"],
+)
+def test_wrong_files_get_one_sentence_and_run_no_code(content, words, published, tmp_path):
+    if content is None:
+        (tmp_path / VGG_FILE).write_bytes(b"\x80\x02not a file of tensors")
+    else:
+        torch.save(content, tmp_path / VGG_FILE)  # noqa: TID251
+    torch.save(published[1], tmp_path / LINEAR_FILE)  # noqa: TID251
+    with pytest.raises(TwofoldError, match=words):
+        load_lpips(tmp_path)
+
+
+def test_weights_given_as_the_other_file_are_refused(published, folder, tmp_path):
+    (tmp_path / VGG_FILE).symlink_to(folder / VGG_FILE)
+    (tmp_path / LINEAR_FILE).symlink_to(folder / VGG_FILE)
+    with pytest.raises(TwofoldError, match=r"lin0.model.1.weight is missing"):
+        load_lpips(tmp_path)

@@ -1,0 +1,149 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from twofold import losses
+
+
+def random(*shape, seed=0):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def literal_l1(color, truth):
+    """Sum over rays of the L1 norm, as printed."""
+    return sum(sum(abs(a - b) for a, b in zip(p, q, strict=True)) for p, q in zip(color, truth, strict=True))
+
+
+@pytest.mark.parametrize("loss", [losses.reconstruction, losses.common])
+def test_color_losses_are_the_printed_sum_or_its_mean(loss):
+    color, truth = random(7, 3), random(7, 3, seed=1)
+    exact = literal_l1(color.tolist(), truth.tolist())
+    assert loss(color, truth, "sum").item() == pytest.approx(exact)
+    assert loss(color, truth).item() == pytest.approx(exact / 21)
+
+
+def test_eikonal_is_the_printed_mean():
+    gradient = random(9, 3) * 3
+    exact = sum((math.sqrt(sum(g * g for g in row)) - 1) ** 2 for row in gradient.tolist()) / 9
+    assert losses.eikonal(gradient).item() == pytest.approx(exact)
+
+
+def test_eikonal_is_zero_for_unit_gradients_and_has_a_finite_slope_at_zero():
+    unit = torch.nn.functional.normalize(random(9, 3) - 0.5, dim=1)
+    assert losses.eikonal(unit).item() == pytest.approx(0, abs=1e-12)
+    flat = torch.zeros(4, 3, requires_grad=True)
+    losses.eikonal(flat).backward()
+    assert flat.grad.isfinite().all()
+
+
+def test_total_is_the_weighted_sum():
+    terms = {name: torch.tensor(value) for name, value in (("rec", 1.0), ("eik", 2.0), ("com", 4.0), ("lpips", 8.0))}
+    weights = {"eik": 0.1, "com": 0.5, "lpips": 1.0}
+    assert losses.total(terms, weights).item() == pytest.approx(1 + 0.1 * 2 + 0.5 * 4 + 8)
+    assert losses.total(terms).item() == pytest.approx(15)
+
+
+@pytest.mark.parametrize(("terms", "weights"), [({}, {}), ({"rec": torch.zeros(())}, {"rce": 1.0})])
+def test_total_refuses_weights_without_terms(terms, weights):
+    with pytest.raises(ValueError, match="weights are for"):
+        losses.total(terms, weights)
+
+
+def test_mask_adds_the_means_of_both_sides():
+    opacity, coverage = random(10), (random(10, seed=1) > 0.7).double()
+    inside = [1 - o for o, c in zip(opacity.tolist(), coverage.tolist(), strict=True) if c == 1]
+    outside = [o for o, c in zip(opacity.tolist(), coverage.tolist(), strict=True) if c == 0]
+    exact = sum(inside) / len(inside) + sum(outside) / len(outside)
+    assert losses.mask(opacity, coverage).item() == pytest.approx(exact)
+    assert losses.mask(opacity, coverage, "mean").item() == pytest.approx((sum(inside) + sum(outside)) / 10)
+
+
+@pytest.mark.parametrize("form", ["sides", "mean"])
+@pytest.mark.parametrize("covered", [0.0, 1.0])
+def test_mask_is_zero_when_right_even_with_one_side_empty(form, covered):
+    coverage = torch.full((5,), covered)
+    assert losses.mask(coverage, coverage, form).item() == 0
+
+
+def test_soft_pixels_count_to_both_sides_by_their_shares():
+    opacity, coverage = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.75, 0.5, 0.0])
+    inside = (0.75 * 0.25 + 0.5 * 0.5) / 1.25
+    outside = (0.25 * 0.25 + 0.5 * 0.5) / 1.75
+    assert losses.mask(opacity, coverage).item() == pytest.approx(inside + outside)
+    assert losses.mask(coverage, coverage).item() == 0
+
+
+def literal_s3im(color, truth, orders):
+    """Window by window over the virtual picture, borders of zeros, as the term is described."""
+    rays, order = len(color), [i for part in orders for i in part]
+    height = math.isqrt(rays)
+    width = len(order) // height
+    bell = [math.exp(-((i - 1.5) ** 2) / (2 * 1.5**2)) for i in range(4)]
+    norm = sum(bell) ** 2
+    values = []
+    for channel in range(3):
+        pictures = [
+            [[float(c[order[y * width + x]][channel]) for x in range(width)] for y in range(height)]
+            for c in (color, truth)
+        ]
+
+        def pixel(picture, y, x, pictures=pictures):
+            return pictures[picture][y][x] if 0 <= y < height and 0 <= x < width else 0.0
+
+        for top in range(-1, height + 1 - 3, 4):
+            for left in range(-1, width + 1 - 3, 4):
+                window = [
+                    (bell[i] * bell[j] / norm, pixel(0, top + i, left + j), pixel(1, top + i, left + j))
+                    for i in range(4)
+                    for j in range(4)
+                ]
+                m1, m2 = (sum(w[0] * w[k] for w in window) for k in (1, 2))
+                v1, v2 = (sum(w[0] * w[k] ** 2 for w in window) - m**2 for k, m in ((1, m1), (2, m2)))
+                cov = sum(w[0] * w[1] * w[2] for w in window) - m1 * m2
+                ssim = (2 * m1 * m2 + 1e-4) * (2 * cov + 9e-4) / ((m1**2 + m2**2 + 1e-4) * (v1 + v2 + 9e-4))
+                values.append(ssim)
+    return 1 - sum(values) / len(values)
+
+
+@pytest.mark.parametrize("rays", [4, 36, 41])
+def test_s3im_is_the_window_by_window_loop(rays):
+    color, truth = random(rays, 3), random(rays, 3, seed=1)
+    source = torch.Generator().manual_seed(3)
+    orders = [list(range(rays)), *(torch.randperm(rays, generator=source).tolist() for _ in range(9))]
+    found = losses.s3im(color, truth, torch.Generator().manual_seed(3))
+    assert found.item() == pytest.approx(literal_s3im(color.tolist(), truth.tolist(), orders))
+
+
+def test_s3im_lays_576_rays_out_as_24_by_240(monkeypatch):
+    seen = []
+    original = losses._windowed_ssim
+    monkeypatch.setattr(losses, "_windowed_ssim", lambda a, b: (seen.append(a.shape), original(a, b))[1])
+    losses.s3im(random(576, 3), random(576, 3, seed=1), torch.Generator().manual_seed(0))
+    assert seen == [(3, 1, 24, 240)]
+
+
+@given(rays=st.integers(4, 80), seed=st.integers(0, 1000))
+def test_s3im_is_zero_for_equal_colors_and_at_most_two(rays, seed):
+    color, truth = random(rays, 3, seed=seed), random(rays, 3, seed=seed + 1)
+    generator = torch.Generator().manual_seed(seed)
+    assert losses.s3im(color, color, generator).item() == pytest.approx(0, abs=1e-9)
+    assert 0 < losses.s3im(color, truth, generator).item() < 2
+
+
+def test_s3im_of_too_few_rays_is_zero_and_can_be_trained_on():
+    color = torch.rand(3, 3, requires_grad=True)
+    loss = losses.s3im(color, torch.rand(3, 3), torch.Generator())
+    loss.backward()
+    assert loss.item() == 0
+
+
+def test_losses_pass_gradcheck():
+    color, truth = random(9, 3).requires_grad_(), random(9, 3, seed=1)
+    assert torch.autograd.gradcheck(lambda c: losses.reconstruction(c, truth), color)
+    assert torch.autograd.gradcheck(losses.eikonal, color)
+    assert torch.autograd.gradcheck(lambda c: losses.s3im(c, truth, torch.Generator().manual_seed(0)), color)
+    opacity = random(9).requires_grad_()
+    assert torch.autograd.gradcheck(lambda o: losses.mask(o, random(9, seed=1)), opacity)
