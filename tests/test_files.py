@@ -226,6 +226,23 @@ def test_replacing_a_folder_keeps_the_old_one_until_the_new_one_is_complete(tmp_
     assert os.listdir(tmp_path) == ["a"]
 
 
+def test_a_folder_that_cannot_take_its_place_gives_it_back(tmp_path, monkeypatch):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "old").write_bytes(b"x")
+    rename = os.replace
+
+    def refuse_the_new_one(source, target):
+        if "partial" in Path(source).name:
+            raise PermissionError(13, "refused", str(source))
+        rename(source, target)
+
+    monkeypatch.setattr("os.replace", refuse_the_new_one)
+    with pytest.raises(TwofoldError, match="permission"), new_folder(tmp_path / "a", replace=True):
+        pass
+    assert os.listdir(tmp_path) == ["a"]
+    assert os.listdir(tmp_path / "a") == ["old"]
+
+
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),

@@ -2,6 +2,7 @@
 
 import json
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +10,11 @@ import torch
 from PIL import Image
 from tiny_capture import SPLITS, stick_body, tiny_cameras, tiny_motion, write_tiny
 
+from twofold.capture.contents import read_contents
 from twofold.capture.folder import CaptureWriter, read_capture, read_true_motion
+from twofold.capture.validate import joint_positions
 from twofold.errors import TwofoldError
+from twofold.geometry.cameras import project
 
 
 def every_file(folder):
@@ -46,6 +50,20 @@ def test_the_description_is_readable_by_hand(tiny):
     assert "        [50.0, 0.0, 23.5],\n" in text
     assert '"times": [0, 1, 2, 3]' in text
     assert len(text.splitlines()) < 100
+
+
+def test_the_documented_example_is_faultless(tiny):
+    page = (Path(__file__).parents[2] / "docs" / "captures.md").read_text(encoding="utf-8")
+    (tiny / "capture.json").write_text(page.split("```json\n")[1].split("```")[0])
+    contents, faults = read_contents(tiny)
+    assert faults == []
+    assert contents.pictures == {"front": [0, 1, 2, 3, 4, 5], "side": [0, 2, 4, 5]}
+    joints = joint_positions(contents)
+    assert joints is not None
+    for camera in contents.cameras.values():
+        pixels, depths = project(camera, joints)
+        assert (depths > 2).all()
+        assert ((pixels > 0) & (pixels < 256)).all()
 
 
 def test_cameras_keep_every_bit_in_short_decimals(tmp_path):

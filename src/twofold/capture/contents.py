@@ -82,7 +82,7 @@ def numbered_files(folder: Path, endings: tuple[str, ...]) -> dict[int, Path]:
     for ending in reversed(endings):
         for name, path in sorted(found.items()):
             stem = name.removesuffix(ending)
-            if name.endswith(ending) and len(stem) >= 6 and stem.isdecimal() and file_stem(int(stem)) == stem:
+            if name.endswith(ending) and stem.isdecimal() and file_stem(int(stem)) == stem:
                 numbered[int(stem)] = path
     return dict(sorted(numbered.items()))
 
