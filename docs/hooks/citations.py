@@ -49,7 +49,7 @@ def modules(source: Path = SOURCE) -> dict[str, Path]:
 
 
 def functions(tree: ast.AST, prefix: str) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-    """Functions and methods with their dotted names, those inside of classes included, those inside of functions not."""
+    """Functions and methods with their dotted names, but not the functions inside of functions."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield f"{prefix}.{node.name}", node
