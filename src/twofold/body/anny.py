@@ -33,8 +33,8 @@ BONES = (
 """Anny's bone for each SMPL joint; the weights of every other bone go to its nearest ancestor among these."""
 
 SHAPES = 10
-_PEOPLE = 256
-_CACHE_VERSION = 1
+_PEOPLE = 100
+_CACHE_VERSION = 2
 _HEIGHT = (0.385, 0.06)
 """Mean and spread of the height trait: people of 1.70 m, give or take 8 cm (one half would be 1.83 m)."""
 
@@ -109,10 +109,10 @@ def _build(data: Path) -> Body:
     faces = _triangles(vertices, _skin_quads(groups))
     kept, faces = np.unique(faces, return_inverse=True)
     weights = _merged_weights(rig, painted, len(vertices))[kept]
-    means = _joint_means(rig, groups)
+    regressor = _joint_regressor(rig, groups, len(vertices))
 
     people = vertices + _random_changes(data, len(vertices))
-    straight = [_straight(person[kept], means, person, weights) for person in people]
+    straight = [_straight(person[kept], regressor @ person, weights) for person in people]
     mean, basis = _principal_components(np.stack(straight))
     return Body.from_arrays(
         {
@@ -162,9 +162,7 @@ def _triangles(vertices: Float[np.ndarray, "n 3"], quads: Int[np.ndarray, "q 4"]
     return np.take_along_axis(quads, corners, axis=1).reshape(-1, 3)
 
 
-def _merged_weights(
-    rig: dict[str, Any], painted: dict[str, list[tuple[int, float]]], n: int
-) -> Float[np.ndarray, "n 24"]:
+def _merged_weights(rig: dict[str, Any], painted: dict[str, Any], n: int) -> Float[np.ndarray, "n 24"]:
     weights = np.zeros((n, len(BONES)))
     for bone, entries in painted.items():
         kept = bone
@@ -175,16 +173,17 @@ def _merged_weights(
     return weights / np.maximum(weights.sum(1, keepdims=True), 1e-12)
 
 
-def _joint_means(rig: dict[str, Any], groups: dict[str, list[list[int]]]) -> list[Int[np.ndarray, "k"]]:
-    """The vertices whose mean each joint is."""
-    means: list[np.ndarray] = []
-    for bone in BONES:
+def _joint_regressor(rig: dict[str, Any], groups: dict[str, list[list[int]]], n: int) -> Float[np.ndarray, "24 n"]:
+    """Each joint is the mean of some vertices of the mesh, most often of a little cube around it."""
+    regressor = np.zeros((len(BONES), n))
+    for row, bone in zip(regressor, BONES, strict=True):
         head = rig[bone]["head"]
         if head["strategy"] == "CUBE":
-            means.append(np.unique(groups[head["cube_name"]]))
+            chosen = np.unique(groups[head["cube_name"]])
         else:
-            means.append(np.array(head["vertex_indices"] if head["strategy"] == "MEAN" else [head["vertex_index"]]))
-    return means
+            chosen = np.array(head["vertex_indices"] if head["strategy"] == "MEAN" else [head["vertex_index"]])
+        row[chosen] = 1 / len(chosen)
+    return regressor
 
 
 def _random_changes(data: Path, n: int) -> Float[np.ndarray, "people n 3"]:
@@ -238,14 +237,10 @@ def _read_target(path: Path, n: int) -> Float[np.ndarray, "m"]:
 
 
 def _straight(
-    skin: Float[np.ndarray, "V 3"],
-    means: list[Int[np.ndarray, "k"]],
-    person: Float[np.ndarray, "n 3"],
-    weights: Float[np.ndarray, "V 24"],
+    vertices: Float[np.ndarray, "V 3"], joints: Float[np.ndarray, "24 3"], weights: Float[np.ndarray, "V 24"]
 ) -> Float[np.ndarray, "J 3"]:
     """Joints, then vertices of one person in the T-pose."""
-    joints = np.stack([person[m].mean(0) for m in means])
-    t_vertices, t_joints, _ = straighten(*(torch.from_numpy(x) for x in (skin, joints, weights)))
+    t_vertices, t_joints, _ = straighten(*(torch.from_numpy(x) for x in (vertices, joints, weights)))
     placed = torch.cat([t_joints, t_vertices]) - t_joints[0] + torch.tensor(_PELVIS, dtype=torch.float64)
     return placed.numpy()
 

@@ -21,7 +21,7 @@ from twofold.body.anny import anny_body
 from twofold.body.skeleton import Body, PosedBody, ShapedBody, pose_body, shape_body
 from twofold.capture.folder import CaptureWriter
 from twofold.capture.studio_folds import Fold, displacement, lay_folds
-from twofold.capture.studio_light import cast_shade, illuminate
+from twofold.capture.studio_light import Beads, cast_shade, illuminate, thread_beads
 from twofold.capture.studio_look import Look, draw_look
 from twofold.capture.studio_motion import choreograph
 from twofold.capture.studio_paint import paint
@@ -88,6 +88,7 @@ class Performer:
         look: clothes and colours.
         figure: the dressed person in the canonical pose.
         folds: its wrinkles.
+        beads: where light and shade are worked out.
         poses: of all moments, radians.
         translations: of all moments, metres; the soles touch the floor.
     """
@@ -98,6 +99,7 @@ class Performer:
     look: Look
     figure: Figure
     folds: tuple[Fold, ...]
+    beads: Beads
     poses: Float[np.ndarray, "T 24 3"]
     translations: Float[np.ndarray, "T 3"]
 
@@ -122,7 +124,8 @@ def cast(seed: int, rehearsed: int, unrehearsed: int) -> Performer:
     lowest = [_posed(shaped, pose, np.zeros(3)).vertices[:, 1].min().item() - 0.016 for pose in poses]
     root = shaped.joints[0].numpy()
     translations = np.stack([sway[:, 0] - root[0], -np.array(lowest), sway[:, 1] - root[2]], -1).astype(np.float32)
-    return Performer(body, betas, shaped, look, figure, lay_folds(figure, seed), poses, translations)
+    beads = thread_beads(figure.vertices, figure.normals)
+    return Performer(body, betas, shaped, look, figure, lay_folds(figure, seed), beads, poses, translations)
 
 
 def _posed(shaped: ShapedBody, pose: Float[np.ndarray, "24 3"], translation: Float[np.ndarray, "3"]) -> PosedBody:
@@ -137,8 +140,8 @@ def perform(performer: Performer, time: int) -> Moment:
     bones = _posed(performer.shaped, pose, performer.translations[time]).bones.numpy()
     vertices = skin_sparsely(canonical, figure.weights, bones)
     normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(figure.faces)).numpy()
-    shade = cast_shade(vertices, normals)
-    return Moment(vertices, normals, shade.key, shade.sky)
+    key, sky = cast_shade(vertices, normals, performer.beads)
+    return Moment(vertices, normals, key, sky)
 
 
 def skin_sparsely(
@@ -196,7 +199,7 @@ def make_studio(config: StudioConfig, out: Path, progress: Callable[[float], Non
     try:
         with CaptureWriter(out) as writer:
             performer = cast(config.seed, rehearsed, config.frames - rehearsed)
-            cameras = ring(config.cameras, config.size, *_extent(performer))
+            cameras = ring(config.cameras, config.size, _outline(performer))
             _film(config, performer, cameras, splits, writer, progress or (lambda _: None))
             given_poses, given_translations = _disturbed(config, performer)
             disturbed = config.pose_noise > 0
@@ -236,13 +239,16 @@ def plan_splits(frames: int, cameras: int) -> dict[str, dict[str, list[int]]]:
     }
 
 
-def _extent(performer: Performer) -> tuple[tuple[float, float], float]:
-    """Lowest and highest point of the whole motion, and how far it reaches from the middle; metres."""
-    joints = [_posed(performer.shaped, p, t).joints for p, t in zip(performer.poses, performer.translations, strict=True)]
-    points = torch.stack(joints)
-    head = float(performer.figure.vertices[:, 1].max() - performer.figure.anatomy.joints[15, 1])
-    high = max(float(points[:, 15, 1].max()) + head, float(points[:, 22:, 1].max()) + 0.1)
-    return (0.0, high), float(points[..., [0, 2]].norm(dim=-1).max()) + 0.1
+def _outline(performer: Performer) -> Float[np.ndarray, "n 3"]:
+    """Points that bound the person over the whole motion: joints with room for flesh, hair and soles."""
+    moments = zip(performer.poses, performer.translations, strict=True)
+    joints = torch.stack([_posed(performer.shaped, p, t).joints for p, t in moments]).numpy()
+    head = performer.figure.vertices[:, 1].max() - performer.figure.anatomy.joints[15, 1]
+    up = np.float32([0, 1, 0])
+    feet, hands = joints[:, [7, 8, 10, 11]], joints[:, 22:]
+    ends = [joints[:, 15] + head * up, feet * (1 - up), *(hands + 0.1 * d for d in np.float32(np.eye(3)))]
+    ends += [hands - 0.1 * d for d in np.float32(np.eye(3))] + [feet + [0.1, 0, 0], feet - [0.1, 0, 0]]
+    return np.concatenate([end.reshape(-1, 3) for end in ends]).astype(np.float32)
 
 
 def _film(

@@ -4,7 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy import sparse
+from scipy.spatial import cKDTree
 
 from twofold.capture.studio_paint import Paint
 
@@ -18,15 +20,32 @@ KEY_COLOR = np.float32([1.02, 0.96, 0.88])
 RIM_COLOR = np.float32([0.30, 0.33, 0.40])
 SKY, GROUND = np.float32([0.46, 0.49, 0.54]), np.float32([0.27, 0.25, 0.23])
 
-_CELL = 0.012
-_BIAS = 0.016
+_CELL = 0.016
+_BIAS = 0.020
+_GAP = 0.009
+"""Cells of the grids seen from the lights, how far behind its front a point is still lit, and between points; metres."""
 
 
-class Shade(NamedTuple):
-    """How much of the key light and of the sky reaches each vertex, 0..1."""
+class Beads(NamedTuple):
+    """Vertices spread evenly over the surface, for which light is worked out, and the way back to all vertices."""
 
-    key: Float[np.ndarray, "V"]
-    sky: Float[np.ndarray, "V"]
+    index: Int[np.ndarray, "b"]
+    spread: sparse.csr_matrix
+
+
+def thread_beads(vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"]) -> Beads:
+    """Choose one vertex in every small cube, and mix the few nearest of them for every other vertex."""
+    cubes = np.floor((vertices - vertices.min(0)) / _GAP).astype(np.int64)
+    key = (cubes[:, 0] * 4096 + cubes[:, 1]) * 4096 + cubes[:, 2]
+    index = np.unique(key, return_index=True)[1]
+    distance, near = cKDTree(vertices[index]).query(vertices, k=4)
+    # Light on the other side of a thin part is none of a vertex's business.
+    alike = (normals[index][near] * normals[:, None]).sum(-1).clip(0.02)
+    weight = alike / (distance + 0.003)
+    weight /= weight.sum(1, keepdims=True)
+    rows = np.arange(0, 4 * len(vertices) + 1, 4)
+    spread = sparse.csr_matrix((weight.astype(np.float32).ravel(), near.ravel(), rows), (len(vertices), len(index)))
+    return Beads(index, spread)
 
 
 def _directions() -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "s 3"]]:
@@ -34,52 +53,55 @@ def _directions() -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "s 3"]]:
     side = np.cross(KEY, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     up = np.cross(side, KEY)
-    key = [KEY + 0.10 * (a * side + b * up) for a, b in ((1, 0.3), (-0.3, 1), (-1, -0.3), (0.3, -1))]
+    key = np.float32([KEY + 0.09 * (a * side + b * up) for a, b in ((1, 0), (-0.5, 0.87), (-0.5, -0.87))])
     golden = np.pi * (3 - np.sqrt(5))
-    height = np.linspace(0.95, -0.35, 10)
-    sky = [[np.cos(i * golden) * np.sqrt(1 - h * h), h, np.sin(i * golden) * np.sqrt(1 - h * h)] for i, h in enumerate(height)]
-    return np.float32(key) / np.linalg.norm(key, axis=1, keepdims=True).astype(np.float32), np.float32(sky)
+    height, turn = np.linspace(0.95, -0.25, 8), golden * np.arange(8)
+    flat = np.sqrt(1 - height**2)
+    sky = np.stack([np.cos(turn) * flat, height, np.sin(turn) * flat], -1)
+    return key / np.linalg.norm(key, axis=1, keepdims=True), sky.astype(np.float32)
 
 
-def cast_shade(vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"]) -> Shade:
-    """Which light reaches which vertex of a posed, densely sampled surface.
+def cast_shade(
+    vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"], beads: Beads
+) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
+    """How much of the key light and of the sky reaches each vertex of a posed surface, 0..1.
 
-    The surface is dense enough that its vertices alone, dropped into a grid of cells seen from the light, tell what is
-    in front; a vertex a little behind the front of its cell lies in shade.
+    The beads lie so densely that they alone, dropped into a grid of cells seen from the light, tell what is in front; a
+    bead well behind the front of its cell lies in shade.
     """
     key_directions, sky_directions = _directions()
-    v = torch.from_numpy(vertices)
-    key = sum(_lit(v, d) for d in torch.from_numpy(key_directions)) / len(key_directions)
+    v, n = torch.from_numpy(vertices[beads.index]), torch.from_numpy(normals[beads.index])
+    key = torch.zeros(len(v))
+    for direction in torch.from_numpy(key_directions):
+        key += _lit(v, direction) / len(key_directions)
     weighted, total = torch.zeros(len(v)), torch.full((len(v),), 1e-3)
     for direction in torch.from_numpy(sky_directions):
-        facing = (torch.from_numpy(normals) @ direction).clamp_min(0) * (0.75 + 0.25 * direction[1])
+        facing = (n @ direction).clamp_min(0) * (0.75 + 0.25 * direction[1])
         weighted += facing * _lit(v, direction)
         total += facing
-    return Shade(key.numpy(), (weighted / total).numpy())
+    both = beads.spread @ torch.stack([key, weighted / total], -1).numpy()
+    return both[:, 0], both[:, 1]
 
 
-def _lit(vertices: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-    """Share of light from one direction that arrives, softened over neighbouring cells."""
+def _lit(vertices: Float[torch.Tensor, "b 3"], direction: Float[torch.Tensor, "3"]) -> Float[torch.Tensor, "b"]:
+    """Share of the light from one direction that arrives, softened over neighbouring cells."""
     helper = torch.tensor([0.0, 0.0, 1.0]) if abs(float(direction[1])) > 0.9 else torch.tensor([0.0, 1.0, 0.0])
     right = torch.linalg.cross(helper, direction)
     right = right / right.norm()
     up = torch.linalg.cross(direction, right)
-    plane = torch.stack([vertices @ right, vertices @ up], -1) / _CELL
-    depth = -(vertices @ direction)
-    low = plane.amin(0) - 1.5
-    at = plane - low
-    size = at.amax(0).ceil().long() + 2
-    cell = at.round().long()
-    front = torch.full((int(size[0] * size[1]),), torch.inf)
-    front.scatter_reduce_(0, cell[:, 0] * size[1] + cell[:, 1], depth, "amin")
-    base = at.floor().long()
-    part = at - base
+    x, y, depth = vertices @ (right / _CELL), vertices @ (up / _CELL), -(vertices @ direction)
+    x, y = x - (x.min() - 1.5), y - (y.min() - 1.5)
+    stride = int(y.max()) + 3
+    front = torch.full(((int(x.max()) + 3) * stride,), torch.inf)
+    front.scatter_reduce_(0, x.round().long() * stride + y.round().long(), depth, "amin")
+    left, below = x.floor(), y.floor()
+    px, py = x - left, y - below
+    corner = left.long() * stride + below.long()
     lit = torch.zeros(len(vertices))
-    for i in (0, 1):
-        for j in (0, 1):
-            weight = (part[:, 0] if i else 1 - part[:, 0]) * (part[:, 1] if j else 1 - part[:, 1])
-            gap = depth - front[(base[:, 0] + i) * size[1] + base[:, 1] + j]
-            lit += weight * (1 - ((gap - _BIAS) / 0.01).clamp(0, 1))
+    for i, wx in ((0, 1 - px), (1, px)):
+        for j, wy in ((0, 1 - py), (1, py)):
+            gap = depth - front[corner + (i * stride + j)]
+            lit += wx * wy * (1 - (gap - _BIAS) * 80).clamp(0, 1)
     return lit
 
 
@@ -103,11 +125,11 @@ def illuminate(
     from_rim = np.clip(normals @ RIM, 0, None) * (0.3 + 0.7 * sky)
     up = (0.5 + 0.5 * normals[:, 1])[:, None]
     ambient = (GROUND + up * (SKY - GROUND)) * (0.25 + 0.75 * sky)[:, None]
-    light = 0.95 * from_key[:, None] * KEY_COLOR + from_rim[:, None] * RIM_COLOR + ambient
+    light = 1.05 * from_key[:, None] * KEY_COLOR + from_rim[:, None] * RIM_COLOR + ambient
     half = to_camera + KEY
     half = half / np.linalg.norm(half, axis=1, keepdims=True)
     shine = np.clip((normals * half).sum(1), 0, None) ** 24 * key * paint.gloss
-    return to_srgb(0.86 * paint.color * light + shine[:, None] * KEY_COLOR)
+    return to_srgb(0.95 * paint.color * light + shine[:, None] * KEY_COLOR)
 
 
 def to_srgb(light: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:

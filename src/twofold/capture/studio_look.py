@@ -73,12 +73,13 @@ def draw_look(seed: int) -> Look:
     first, second, third = _CLOTHS[(seed * 3 + int(random.integers(2))) % len(_CLOTHS)]
     shoe, sole = _SHOES[int(random.integers(len(_SHOES)))]
     long_sleeve = shirt == "buttons" or random.random() < 0.3
+    hair = HAIRS[(seed * 3 + int(random.integers(3))) % len(HAIRS)]
     return Look(
         shirt=shirt,
         sleeve=float(random.uniform(1.72, 1.86) if long_sleeve else random.uniform(0.58, 0.72)),
         trouser=float(random.uniform(1.80, 1.88) if random.random() < 0.65 else random.uniform(0.80, 0.90)),
-        hair=HAIRS[(seed * 3 + int(random.integers(3))) % len(HAIRS)],
-        beard=bool(random.random() < 0.3),
+        hair=hair,
+        beard=bool(random.random() < 0.45) and hair not in ("bob", "bun", "ponytail"),
         emblem=int(random.integers(3)),
         number=int(random.integers(10, 100)),
         shirt_color=first,

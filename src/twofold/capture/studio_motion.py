@@ -24,7 +24,7 @@ class Leg:
     """Degrees. `lift` swings the thigh ahead, `out` sideways, `turn` points the foot outward, `knee` bends."""
 
     lift: float = 0
-    out: float = 4
+    out: float = 2
     turn: float = 8
     knee: float = 4
 

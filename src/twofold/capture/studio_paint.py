@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from twofold.capture.studio_look import Color, Look
-from twofold.capture.studio_shape import HAIR, SHIRT, SHOES, SKIN, SOLES, TROUSERS, Anatomy, arm_reach, smoothstep
+from twofold.capture.studio_shape import HAIR, SHIRT, SHOES, SKIN, SOLES, TROUSERS, Anatomy, arm_reach, collar, smoothstep
 
 
 @dataclass(frozen=True)
@@ -143,8 +143,8 @@ def _shirt(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
     hem = y - (a.crotch + 0.035)
     elbow, wrist, shoulder = abs(j[18, 0]), abs(j[20, 0]), abs(j[16, 0])
     cuff = np.interp(look.sleeve, [0, 1, 2], [shoulder, elbow, wrist]) - np.abs(x)
-    neck = -((y - j[12, 1] + 0.012) * 0.82 + (z - j[12, 2]) * 0.57)
-    collar = (neck < 0.022) & ~sleeve
+    neck = collar(p, a)
+    band = (neck < 0.017) & ~sleeve
     if look.shirt == "stripes":
         color = _mix(color, second, ((along / 0.052) % 1 < 0.42).astype(np.float32))
     elif look.shirt == "checks":
@@ -157,7 +157,7 @@ def _shirt(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
         color = _mix(color, second, (front & _emblem(x, y - j[9, 1] + 0.035, look.emblem)).astype(np.float32))
         back = (z < j[9, 2]) & ~sleeve
         color = _mix(color, second, (back & _digits(-x, y - j[9, 1] + 0.03, look.number)).astype(np.float32))
-        color = _mix(color, second, ((cuff < 0.025) | collar).astype(np.float32))
+        color = _mix(color, second, ((cuff < 0.025) | band).astype(np.float32))
     elif look.shirt == "buttons":
         color = _mix(color, second, 0.55 * (((angle * np.where(sleeve, 11, 36)) / (2 * np.pi)) % 1 < 0.22))
         front = (z > j[9, 2]) & ~sleeve
@@ -169,7 +169,7 @@ def _shirt(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
         color = _mix(
             color, np.float32([[0.1, 0.09, 0.08]]), (front & (np.abs(spot - 0.0085) < 0.0015)).astype(np.float32)
         )
-        color = _mix(color, second, 0.8 * collar)
+        color = _mix(color, second, 0.8 * band)
     else:
         chest = y - j[9, 1] - 0.02
         color = _mix(color, second, ((chest > 0) | sleeve).astype(np.float32))
@@ -179,7 +179,7 @@ def _shirt(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
         color = _mix(color, second, (back & _digits(-x, y - j[9, 1] + 0.16, look.number)).astype(np.float32))
     stitches = np.maximum(_line(hem - 0.014, 0.003), _line(cuff - 0.014, 0.003))
     seams = np.maximum(stitches, _line((reach - 0.10) * (elbow - shoulder), 0.005))
-    seams = np.maximum(seams, _line(neck - 0.022, 0.005) * ~sleeve)
+    seams = np.maximum(seams, _line(neck - 0.017, 0.005) * ~sleeve)
     color = _mix(color, 0.45 * color, 0.7 * seams)
     return color * (1 + 0.05 * _grain(p, 0.011))[:, None]
 
@@ -234,7 +234,9 @@ def _trousers(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
     base = linear(look.trouser_color)
     j = a.joints
     side = np.where(p[:, 0] >= 0, 1.0, -1.0)
-    dx, dz = (p[:, 0] - side * abs(j[1, 0])) * side, p[:, 2] - j[4, 2]
+    heights = [j[7, 1], j[4, 1], j[1, 1]]
+    dx = p[:, 0] * side - np.interp(p[:, 1], heights, np.abs(j[[7, 4, 1], 0]))
+    dz = p[:, 2] - np.interp(p[:, 1], heights, j[[7, 4, 1], 2])
     end = np.interp(look.trouser, [0, 1, 2], [j[1, 1], j[4, 1], j[7, 1]])
     hem = p[:, 1] - end
     worn = np.exp(-(((p[:, 1] - 0.5 * (j[1, 1] + j[4, 1])) / 0.2) ** 2)) * smoothstep(0.0, 0.06, dz)

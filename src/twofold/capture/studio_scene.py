@@ -9,40 +9,38 @@ from scipy import ndimage
 
 from twofold.geometry.cameras import Camera, pixel_grid, pixel_rays
 from twofold.geometry.raster import supersampled
+from twofold.geometry.rotations import rigid_transform
 
 DISTANCE, HEIGHT = 3.0, 1.2
 """Of the cameras from the middle of the studio and above its floor, metres."""
 
 
-def ring(count: int, size: int, reach: tuple[float, float], width: float) -> dict[str, Camera]:
+def ring(count: int, size: int, body: Float[np.ndarray, "n 3"]) -> dict[str, Camera]:
     """Cameras evenly around the middle, all looking at it; the first one stands ahead (+z).
 
     Args:
         count: how many.
         size: rows and columns of their pictures.
-        reach: lowest and highest point that must be seen, metres above the floor.
-        width: how far from the middle a person reaches sideways, metres.
+        body: points that must be seen, world, metres.
     """
-    low, high = reach
-    middle = 0.5 * (low + high)
-    near = DISTANCE - 0.35
-    tall = 0.5 * (high - low) / near
-    focal = 0.5 * size * 0.93 / max(tall, 0.97 * width / near)
-    cameras: dict[str, Camera] = {}
-    for i in range(count):
-        angle = 2 * math.pi * i / count
-        eye = torch.tensor([DISTANCE * math.sin(angle), HEIGHT, DISTANCE * math.cos(angle)])
-        forward = torch.tensor([0.0, middle, 0.0]) - eye
-        forward = forward / forward.norm()
-        right = torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0]))
-        right = right / right.norm()
-        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        pose = torch.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
-        center = 0.5 * (size - 1)
-        intrinsics = torch.tensor([[focal, 0.0, center], [0.0, focal, center], [0.0, 0.0, 1.0]])
-        cameras[f"camera{i:02d}"] = Camera(pose, intrinsics, size, size)
-    return cameras
+    middle = 0.5 * float(body[:, 1].min() + body[:, 1].max())
+    views = [_toward(2 * math.pi * i / count, middle) for i in range(count)]
+    rays = [body @ view[:3, :3].T.numpy() + view[:3, 3].numpy() for view in views]
+    widest = max(float(np.abs(ray[:, :2] / ray[:, 2:]).max()) for ray in rays)
+    focal, center = 0.5 * 0.98 * size / widest, 0.5 * (size - 1)
+    intrinsics = torch.tensor([[focal, 0.0, center], [0.0, focal, center], [0.0, 0.0, 1.0]])
+    return {f"camera{i:02d}": Camera(view, intrinsics, size, size) for i, view in enumerate(views)}
+
+
+def _toward(angle: float, middle: float) -> Float[torch.Tensor, "4 4"]:
+    """World to camera for a place on the ring, looking at the axis of the studio at some height."""
+    eye = torch.tensor([DISTANCE * math.sin(angle), HEIGHT, DISTANCE * math.cos(angle)])
+    forward = torch.tensor([0.0, middle, 0.0]) - eye
+    forward = forward / forward.norm()
+    right = torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0]))
+    right = right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    return rigid_transform(rotation, -rotation @ eye)
 
 
 def room(camera: Camera, seed: int) -> Float[np.ndarray, "h w 3"]:

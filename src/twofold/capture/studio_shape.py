@@ -21,7 +21,7 @@ from twofold.capture.studio_look import Look
 from twofold.geometry.cameras import Camera
 from twofold.geometry.raster import rasterize
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_transform
-from twofold.geometry.surfaces import split_edges, vertex_normals
+from twofold.geometry.surfaces import face_normals, split_edges, vertex_normals
 
 SKIN, SHIRT, TROUSERS, SHOES, SOLES, HAIR = range(6)
 """Layers, in the order of `Figure.layers`."""
@@ -35,15 +35,15 @@ _FAR = 0.018
 class Anatomy(NamedTuple):
     """Where things are on this body in the T-pose, metres; and dense samples of it in the canonical pose.
 
-    `joints`, `eyes` (left, right), `spread` between the eyes, `crotch`, `crown` and `floor` heights are those of the
-    T-pose; `points` and `normals` of the samples are canonical, `rest` are the same samples in the T-pose.
+    `joints`, `eyes` (left, right), `spread` between the eyes, `neck` radius, `crotch` and `floor` heights are those of
+    the T-pose; `points` and `normals` of the samples are canonical, `rest` are the same samples in the T-pose.
     """
 
     joints: Float[np.ndarray, "24 3"]
     eyes: Float[np.ndarray, "2 3"]
     spread: float
+    neck: float
     crotch: float
-    crown: float
     floor: float
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -81,25 +81,24 @@ def survey(shaped: ShapedBody) -> Anatomy:
     canonical = posed.canonical_vertices
     faces = faces[_seen_from_outside(canonical, faces, float(shaped.joints[12, 1]))]
     normals = vertex_normals(canonical, faces)
-    dense, dense_faces, parents = split_edges(canonical, faces, torch.ones(len(canonical), dtype=torch.bool))
-    used = torch.unique(dense_faces)
-    dense_normals = normals[parents].mean(1)
-    dense_normals = dense_normals / dense_normals.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    used = torch.unique(faces)
     rest_joints = shaped.joints.numpy()
     points = canonical.numpy()
     near_middle = (np.abs(points[:, 0]) < 0.012) & (points[:, 1] < rest_joints[0, 1])
     crotch = points[near_middle, 1].min() if near_middle.any() else rest_joints[1, 1] - 0.09
+    low, high = rest_joints[12, 1], rest_joints[15, 1]
+    neck = np.abs(points[:, 1] - 0.5 * (low + high)) < 0.2 * (high - low)
     return Anatomy(
         joints=rest_joints,
         eyes=eyes,
         spread=float(np.linalg.norm(eyes[0] - eyes[1])),
+        neck=float(np.median(_around_neck(points[neck], rest_joints))),
         crotch=float(crotch),
-        crown=float(points[:, 1].max()),
         floor=float(shaped.vertices[:, 1].min()),
-        points=dense[used].numpy(),
-        normals=dense_normals[used].numpy(),
-        rest=shaped.vertices[parents].mean(1)[used].numpy(),
-        weights=shaped.weights[parents].mean(1)[used].numpy(),
+        points=torch.cat([canonical[used], canonical[faces].mean(1)]).numpy(),
+        normals=torch.cat([normals[used], face_normals(canonical, faces)]).numpy(),
+        rest=torch.cat([shaped.vertices[used], shaped.vertices[faces].mean(1)]).numpy(),
+        weights=torch.cat([shaped.weights[used], shaped.weights[faces].mean(1)]).numpy(),
     )
 
 
@@ -123,6 +122,23 @@ def _outer_parts(shaped: ShapedBody) -> tuple[torch.Tensor, Float[np.ndarray, "2
             kept |= part == label_
             eyes[0 if middle[0] > 0 else 1] = middle.astype(np.float32)
     return torch.from_numpy(faces[kept[faces[:, 0]]]), np.stack(eyes)
+
+
+def _around_neck(points: Float[np.ndarray, "n 3"], joints: Float[np.ndarray, "24 3"]) -> Float[np.ndarray, "n"]:
+    """Distance from the line through neck and head, which lies a little before the spine; metres."""
+    base, along = joints[12], joints[15] - joints[12]
+    along = along / np.linalg.norm(along)
+    off = points - base - ((points - base) @ along)[:, None] * along
+    return np.hypot(off[:, 0], 0.88 * (off[:, 2] - 0.004))
+
+
+def collar(points: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
+    """How far points of a shirt lie outside the opening for the neck, metres."""
+    opening = _around_neck(points, anatomy.joints) - anatomy.neck - 0.014
+    # Behind, the edge runs at the root of the neck; ahead it comes down to the collar bones.
+    off = points - anatomy.joints[12]
+    edge = -0.82 * (off[:, 1] + 0.030) - 0.57 * off[:, 2]
+    return np.maximum(opening, edge).astype(np.float32)
 
 
 def _seen_from_outside(
@@ -287,14 +303,14 @@ def _shirt(points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy: An
     base = np.minimum(loose - offset, tight - 0.006)
     shoulder, elbow, wrist = abs(j[16, 0]), abs(j[18, 0]), abs(j[20, 0])
     end = np.interp(look.sleeve, [0, 1, 2], [shoulder, elbow, wrist])
-    neck = (y - j[12, 1] + 0.012) * 0.82 + (points[:, 2] - j[12, 2]) * 0.57
-    return np.maximum.reduce([base, np.abs(points[:, 0]) - end, hem - y, neck])
+    above = np.maximum(-collar(points, anatomy), y - anatomy.joints[15, 1])
+    return np.maximum.reduce([base, np.abs(points[:, 0]) - end, hem - y, above])
 
 
 def _trousers(points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy: Anatomy, look: Look) -> np.ndarray:
     reach = leg_reach(points, anatomy)
-    flare = smoothstep(0.3, 2.0, reach) if look.trouser > 1 else 1.6 * smoothstep(0.2, 0.9, reach)
-    base = np.minimum(loose - 0.009 - 0.010 * flare, tight - 0.005)
+    flare = smoothstep(0.3, 1.9, reach) if look.trouser > 1 else smoothstep(0.2, 0.9, reach)
+    base = np.minimum(loose - 0.009 - 0.016 * flare, tight - 0.005)
     j = anatomy.joints
     end = np.interp(look.trouser, [0, 1, 2], [j[1, 1], j[4, 1], j[7, 1]])
     waist = points[:, 1] - (anatomy.joints[0, 1] + 0.06)
@@ -352,7 +368,8 @@ def _hair(points: np.ndarray, round_: np.ndarray, anatomy: Anatomy, look: Look) 
     if look.hair == "quiff":
         thickness += 0.028 * top * smoothstep(-0.6 * unit, 1.0 * unit, p[:, 2])
     if look.hair == "curls":
-        thickness += 0.006 * np.sin(p * 190).sum(1) / 1.7 + 0.008 * top
+        q = p * 170 + 1.5 * np.sin(p[:, [1, 2, 0]] * 75)
+        thickness += 0.0045 * np.sin(q).sum(1) + 0.008 * top
     taper = 0.35 + 0.65 * smoothstep(0.0, 0.022, above) if style != "beanie" else np.ones(len(p))
     shell = np.maximum(round_[near] - 0.004 - thickness * taper, -0.8 * above)
     if look.hair == "bun":
@@ -408,16 +425,16 @@ def _refine_ends(vertices, faces, evaluate, anatomy):  # noqa
 def _skinning_weights(vertices, faces, layers, anatomy, tree):  # noqa
     """Weights of the nearest body samples; cloth shares them with its neighbourhood, hair follows the head alone."""
     distance, index = tree.query(vertices, k=6)
-    near = 1 / (distance + 0.004)
-    weights = (near[..., None] * anatomy.weights[index]).sum(1) / near.sum(1)[:, None]
+    near = (1 / (distance + 0.004)).astype(np.float32)
+    near /= near.sum(1, keepdims=True)
+    weights = np.einsum("vk,vkj->vj", near, anatomy.weights[index])
     label_ = layers.argmin(1)
-    count = len(vertices)
+    cloth = np.nonzero(np.isin(label_, (SHIRT, TROUSERS)))[0]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    graph = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
-    average = sparse.diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
-    cloth = np.isin(label_, (SHIRT, TROUSERS))[:, None]
-    for _ in range(12):
-        weights = np.where(cloth, average @ weights, weights)
+    graph = sparse.coo_matrix((np.ones(len(edges), np.float32), edges.T), shape=(len(vertices),) * 2).tocsr()
+    average = (sparse.diags((1 / np.asarray(graph.sum(1)).ravel()).astype(np.float32)) @ graph).tocsr()[cloth]
+    for _ in range(10):
+        weights[cloth] = average @ weights
     hair = label_ == HAIR
     weights[hair] = 0
     weights[hair, 15] = 1

@@ -13,7 +13,9 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from twofold.deform import shell_kernels
 from twofold.geometry.cameras import Rays, clip_to_box
+from twofold.geometry.threads import in_parts
 from twofold.volume.rendering import Samples
 
 
@@ -25,7 +27,8 @@ class Shell:
         low: corner of the voxel grid, metres.
         voxel: edge of a voxel, metres.
         radius: distance to the nearest vertex that still counts as inside the shell, metres.
-        row: for each voxel of the grid the row of `nearest` that belongs to it, or -1 outside the shell.
+        row: for each voxel of the grid the row of `nearest` that belongs to it; outside the shell -k, where no voxel of
+            the shell is closer than k - 1 voxels.
         nearest: the vertices nearest to each listed voxel's centre, nearest first.
         vertices: the body's vertices, metres.
     """
@@ -44,7 +47,7 @@ class Shell:
         return self.low + self.voxel * size
 
     def rows_at(self, points: Float[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
-        """Row of the voxel that each point lies in, or -1."""
+        """Row of the voxel that each point lies in, or a negative number."""
         cell = ((points - self.low) * (1 / self.voxel)).floor()
         x, y, z = self.row.shape
         flat = (cell[..., 0] * y + cell[..., 1]) * z + cell[..., 2]
@@ -72,13 +75,15 @@ def build_shell(
     seeds = np.ones(shape, dtype=bool)
     seeds[tuple(((surface - low) / voxel).astype(int).T)] = False
     # A voxel is off the surface's own voxel by at most one diagonal, so this keeps a superset of the true shell.
-    near = np.argwhere(ndimage.distance_transform_edt(seeds) * voxel <= radius + np.sqrt(3) * voxel)
+    away = ndimage.distance_transform_edt(seeds)
+    reach = radius / voxel + np.sqrt(3)
+    near = np.argwhere(away <= reach)
     centers = (low + (near + 0.5) * voxel).astype(np.float32)
     distance, nearest = cKDTree(points, balanced_tree=False, compact_nodes=False).query(
         centers, k=candidates, workers=-1, distance_upper_bound=float("inf")
     )
     keep = distance[:, 0] <= radius + np.sqrt(3) / 2 * voxel
-    row = np.full(shape, -1, dtype=np.int32)
+    row = -1 - np.maximum(away - reach, 0).astype(np.int32)
     row[tuple(near[keep].T)] = np.arange(keep.sum(), dtype=np.int32)
     device = vertices.device
     return Shell(
@@ -109,35 +114,59 @@ def nearest_vertices(
 
 
 def sample_shell(
-    shell: Shell, rays: Rays, step: float, generator: torch.Generator | None
-) -> tuple[Samples, Int[Tensor, "S"]]:
-    """Samples every `step` metres along each ray, kept only where the ray runs through the shell's voxels.
+    shell: Shell, rays: Rays, step: float, generator: torch.Generator | None, limit: float
+) -> tuple[Samples, Int[Tensor, "S 1"], Float[Tensor, "S 1"]]:
+    """Samples every `step` metres along each ray, kept only within `limit` of the body.
 
     Args:
         shell: where to sample.
         rays: their near and far bounds are respected.
         step: metres.
         generator: moves each ray's comb of samples by a random part of a step; None puts samples at mid-step.
+        limit: largest distance to the nearest vertex, metres, at most the shell's radius.
 
     Returns:
-        packed samples, and the shell row of each.
+        packed samples, the nearest vertex of each, and its squared distance (metres squared).
     """
     clipped, hit = clip_to_box(rays, shell.low, shell.high)
     ray_ids = hit.nonzero()[:, 0]
     device = rays.origins.device
+    start = torch.full_like(rays.near, 0.5)
+    if generator is not None:
+        start = torch.rand(len(rays), generator=generator, device=generator.device).to(device)
+    clipped, start = clipped[ray_ids], start[ray_ids]
     if len(ray_ids) == 0:
-        empty = torch.zeros(0, device=device)
-        return Samples(ray_ids, empty, empty), ray_ids
-    clipped = clipped[ray_ids]
-    longest = int(((clipped.far - clipped.near) / step).max().ceil())
-    if generator is None:
-        start = torch.full_like(clipped.near, 0.5)
-    else:
-        start = torch.rand(len(rays), generator=generator, device=generator.device).to(device)[ray_ids]
-    steps = torch.arange(longest, device=device, dtype=clipped.near.dtype)
-    depth = clipped.near[:, None] + step * (steps + start[:, None])
-    points = clipped.origins[:, None] + depth[..., None] * clipped.directions[:, None]
+        none = torch.zeros(0, device=device)
+        return Samples(ray_ids, none, none), ray_ids[:, None], none[:, None]
+    find = _walk_in_torch if device.type != "cpu" or rays.origins.dtype != torch.float32 else _walk_compiled
+    ray, depth, nearest, squared = find(shell, clipped, start, step, limit)
+    samples = Samples(ray_ids[ray], depth, torch.full_like(depth, step))
+    return samples, nearest[:, None], squared[:, None]
+
+
+def _walk_compiled(
+    shell: Shell, rays: Rays, start: Tensor, step: float, limit: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    given = [t.contiguous().numpy() for t in (rays.origins, rays.directions, rays.near, rays.far, start)]
+    walls = (np.float32(step), shell.low.numpy(), shell.voxel, shell.row.numpy(), shell.nearest.numpy())
+    vertices = shell.vertices.numpy()
+    parts = in_parts(
+        len(rays), lambda begin, end: shell_kernels.walk(*given, *walls, vertices, limit, begin, end), least=64
+    )
+    ray, depth, nearest, squared = (torch.from_numpy(np.concatenate(part)) for part in zip(*parts, strict=True))  # type: ignore[misc]
+    return ray, depth, nearest, squared
+
+
+def _walk_in_torch(
+    shell: Shell, rays: Rays, start: Tensor, step: float, limit: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The same as `_walk_compiled`, for GPUs and as its slow twin."""
+    longest = int(((rays.far - rays.near) / step).max().ceil())
+    steps = torch.arange(longest, device=rays.near.device, dtype=rays.near.dtype)
+    depth = rays.near[:, None] + step * (steps + start[:, None])
+    points = rays.origins[:, None] + depth[..., None] * rays.directions[:, None]
     rows = shell.rows_at(points)
-    ray, position = ((rows >= 0) & (depth < clipped.far[:, None])).nonzero(as_tuple=True)
-    kept = depth[ray, position]
-    return Samples(ray_ids[ray], kept, torch.full_like(kept, step)), rows[ray, position]
+    ray, position = ((rows >= 0) & (depth < rays.far[:, None])).nonzero(as_tuple=True)
+    nearest, squared = nearest_vertices(shell, points[ray, position], rows[ray, position], 1)
+    close = squared[:, 0] < limit**2
+    return ray[close], depth[ray, position][close], nearest[close, 0], squared[close, 0]

@@ -2,7 +2,8 @@
 
 Legend: S points, L levels, C features; `x` [S 3] points; `table` [N C] features of all levels; `rows` the table row of
 every lattice node, all levels one after the other; `place` [L 4] lower corner and inverse spacing; `shape` [L 4] nodes
-along each axis and where the level begins in `rows`.
+along each axis and where the level begins in `rows`; `begin`, `end` the part of the points (of the levels, in the scatters,
+which own their rows) that a call handles.
 """
 
 import numba
@@ -21,11 +22,11 @@ def _cell(x, place, shape):  # noqa: ANN001, ANN202
 
 
 @numba.njit(cache=True, nogil=True)
-def interpolate(x, table, rows, place, shape, out):  # noqa: ANN001, ANN201
+def interpolate(x, table, rows, place, shape, out, begin, end):  # noqa: ANN001, ANN201
     """out[S, L*C] = trilinear features."""
     channels = table.shape[1]
     one = np.float32(1)
-    for s in range(x.shape[0]):
+    for s in range(begin, end):
         for level in range(place.shape[0]):
             base, u, v, w = _cell(x[s], place[level], shape[level])
             stride_i, stride_j = shape[level, 1] * shape[level, 2], shape[level, 2]
@@ -44,11 +45,11 @@ def interpolate(x, table, rows, place, shape, out):  # noqa: ANN001, ANN201
 
 
 @numba.njit(cache=True, nogil=True)
-def scatter(x, gradient, rows, place, shape, by_table):  # noqa: ANN001, ANN201
+def scatter(x, gradient, rows, place, shape, by_table, begin, end):  # noqa: ANN001, ANN201
     """by_table[N, C] += transpose of `interpolate`; levels own their rows, so they run side by side."""
     channels = by_table.shape[1]
     one = np.float32(1)
-    for level in range(place.shape[0]):
+    for level in range(begin, end):
         stride_i, stride_j = shape[level, 1] * shape[level, 2], shape[level, 2]
         at = level * channels
         for s in range(x.shape[0]):
@@ -65,11 +66,11 @@ def scatter(x, gradient, rows, place, shape, by_table):  # noqa: ANN001, ANN201
 
 
 @numba.njit(cache=True, nogil=True)
-def pull(x, table, cotangent, rows, place, shape, out):  # noqa: ANN001, ANN201
+def pull(x, table, cotangent, rows, place, shape, out, begin, end):  # noqa: ANN001, ANN201
     """out[S, 3] = J^T cotangent, J the derivative of `interpolate` by x."""
     channels = table.shape[1]
     one = np.float32(1)
-    for s in range(x.shape[0]):
+    for s in range(begin, end):
         gx, gy, gz = np.float32(0), np.float32(0), np.float32(0)
         for level in range(place.shape[0]):
             base, u, v, w = _cell(x[s], place[level], shape[level])
@@ -93,11 +94,11 @@ def pull(x, table, cotangent, rows, place, shape, out):  # noqa: ANN001, ANN201
 
 
 @numba.njit(cache=True, nogil=True)
-def pull_scatter(x, cotangent, gradient, rows, place, shape, by_table):  # noqa: ANN001, ANN201
+def pull_scatter(x, cotangent, gradient, rows, place, shape, by_table, begin, end):  # noqa: ANN001, ANN201
     """by_table[N, C] += derivative of <gradient, pull(...)> by the table."""
     channels = by_table.shape[1]
     one = np.float32(1)
-    for level in range(place.shape[0]):
+    for level in range(begin, end):
         stride_i, stride_j = shape[level, 1] * shape[level, 2], shape[level, 2]
         at = level * channels
         scale = place[level, 3]
@@ -117,11 +118,11 @@ def pull_scatter(x, cotangent, gradient, rows, place, shape, by_table):  # noqa:
 
 
 @numba.njit(cache=True, nogil=True)
-def push(x, table, gradient, rows, place, shape, out):  # noqa: ANN001, ANN201
+def push(x, table, gradient, rows, place, shape, out, begin, end):  # noqa: ANN001, ANN201
     """out[S, L*C] = J gradient: the derivative of <gradient, pull(...)> by the cotangent."""
     channels = table.shape[1]
     one = np.float32(1)
-    for s in range(x.shape[0]):
+    for s in range(begin, end):
         for level in range(place.shape[0]):
             base, u, v, w = _cell(x[s], place[level], shape[level])
             stride_i, stride_j = shape[level, 1] * shape[level, 2], shape[level, 2]

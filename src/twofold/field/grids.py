@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from twofold.field import grid_kernels as kernels
+from twofold.geometry.threads import in_parts
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,8 @@ class _Interpolate(torch.autograd.Function):
         ctx.save_for_backward(table, x)
         ctx.lattices = lattices
         out = np.empty((len(x), table.shape[1] * len(lattices.place)), dtype=np.float32)
-        kernels.interpolate(x.detach().contiguous().numpy(), table.detach().numpy(), *_arrays(lattices), out)
+        given = (x.detach().contiguous().numpy(), table.detach().numpy(), *_arrays(lattices), out)
+        in_parts(len(x), lambda begin, end: kernels.interpolate(*given, begin, end))
         return torch.from_numpy(out)
 
     @staticmethod
@@ -131,10 +133,12 @@ class _Interpolate(torch.autograd.Function):
         by_table = by_x = None
         if ctx.needs_input_grad[0]:
             by_table = torch.zeros_like(table)
-            kernels.scatter(points, slopes, *arrays, by_table.numpy())
+            given = (points, slopes, *arrays, by_table.numpy())
+            in_parts(len(ctx.lattices.place), lambda begin, end: kernels.scatter(*given, begin, end), least=1)
         if ctx.needs_input_grad[1]:
             by_x = torch.empty_like(x)
-            kernels.pull(points, table.detach().numpy(), slopes, *arrays, by_x.numpy())
+            more = (points, table.detach().numpy(), slopes, *arrays, by_x.numpy())
+            in_parts(len(x), lambda begin, end: kernels.pull(*more, begin, end))
         return by_table, by_x, None
 
 
@@ -145,7 +149,8 @@ class _Pullback(torch.autograd.Function):
         ctx.save_for_backward(table, x, cotangent)
         ctx.lattices = lattices
         out = torch.empty(len(x), 3)
-        kernels.pull(x.numpy(), table.detach().numpy(), cotangent.numpy(), *_arrays(lattices), out.numpy())
+        given = (x.numpy(), table.detach().numpy(), cotangent.numpy(), *_arrays(lattices), out.numpy())
+        in_parts(len(x), lambda begin, end: kernels.pull(*given, begin, end))
         return out
 
     @staticmethod
@@ -155,10 +160,12 @@ class _Pullback(torch.autograd.Function):
         by_table = by_cotangent = None
         if ctx.needs_input_grad[0]:
             by_table = torch.zeros_like(table)
-            kernels.pull_scatter(x.numpy(), cotangent.numpy(), slopes, *arrays, by_table.numpy())
+            given = (x.numpy(), cotangent.numpy(), slopes, *arrays, by_table.numpy())
+            in_parts(len(ctx.lattices.place), lambda begin, end: kernels.pull_scatter(*given, begin, end), least=1)
         if ctx.needs_input_grad[2]:
             by_cotangent = torch.empty_like(cotangent)
-            kernels.push(x.numpy(), table.detach().numpy(), slopes, *arrays, by_cotangent.numpy())
+            more = (x.numpy(), table.detach().numpy(), slopes, *arrays, by_cotangent.numpy())
+            in_parts(len(x), lambda begin, end: kernels.push(*more, begin, end))
         return by_table, None, by_cotangent, None
 
 

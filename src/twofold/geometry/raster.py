@@ -46,39 +46,42 @@ def rasterize(
         cull: leave out triangles seen from behind (counter-clockwise is outside). Half the work for a closed mesh.
     """
     in_camera = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    projected = in_camera @ camera.intrinsics.T
-    corners = (projected[:, :2] / projected[:, 2:])[faces]
-    inverse_depth = (1 / in_camera[:, 2])[faces]
-    origin = corners[:, 0]
-    first, second = corners[:, 1] - origin, corners[:, 2] - origin
+    inverse_depth = 1 / in_camera[:, 2]
+    projected = in_camera @ camera.intrinsics[:2].T * inverse_depth[:, None]
+    a, b, c = (projected[faces[:, corner]] for corner in range(3))
+    first, second = b - a, c - a
     doubled_area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     # The picture's y axis points down, so a triangle seen from outside turns the other way there.
-    faces_us = doubled_area < -1e-12 if cull else doubled_area.abs() > 1e-12
-    size = torch.tensor([camera.width, camera.height], dtype=corners.dtype, device=corners.device)
-    low = corners.amin(1).sub(_ON_THE_EDGE).ceil().clamp_min(0)
-    high = torch.minimum(corners.amax(1).add(_ON_THE_EDGE).floor(), size - 1)
+    kept = torch.nonzero(doubled_area < -1e-12 if cull else doubled_area.abs() > 1e-12)[:, 0]
+    origin, b, c = a[kept], b[kept], c[kept]
+    depths = inverse_depth[faces[kept]]
+    size = torch.tensor([camera.width, camera.height], dtype=origin.dtype, device=origin.device)
+    low = torch.minimum(torch.minimum(origin, b), c).sub(_ON_THE_EDGE).ceil().clamp_min(0)
+    high = torch.minimum(torch.maximum(torch.maximum(origin, b), c).add(_ON_THE_EDGE).floor(), size - 1)
     spans = (high - low + 1).clamp_min(0)
-    kept = torch.nonzero(faces_us & (inverse_depth.amin(1) > 0) & (spans.amin(1) > 0))[:, 0]
+    wanted = (spans[:, 0] * spans[:, 1] > 0) & (depths[:, 0] > 0) & (depths[:, 1] > 0) & (depths[:, 2] > 0)
+    kept, low, spans, origin, depths = kept[wanted], low[wanted], spans[wanted], origin[wanted], depths[wanted]
+    first, second = first[kept], second[kept]
     scale = 1 / doubled_area[kept]
     # b1 = b1x * x + b1y * y and b2 likewise, with x and y counted from the first corner.
     table = torch.stack(
         [
-            low[kept, 0] - origin[kept, 0],
-            low[kept, 1] - origin[kept, 1],
-            second[kept, 1] * scale,
-            -second[kept, 0] * scale,
-            -first[kept, 1] * scale,
-            first[kept, 0] * scale,
-            inverse_depth[kept, 0],
-            inverse_depth[kept, 1] - inverse_depth[kept, 0],
-            inverse_depth[kept, 2] - inverse_depth[kept, 0],
+            low[:, 0] - origin[:, 0],
+            low[:, 1] - origin[:, 1],
+            second[:, 1] * scale,
+            -second[:, 0] * scale,
+            -first[:, 1] * scale,
+            first[:, 0] * scale,
+            depths[:, 0],
+            depths[:, 1] - depths[:, 0],
+            depths[:, 2] - depths[:, 0],
         ],
         -1,
     ).float()
-    low_pixel = (low[kept, 1] * camera.width + low[kept, 0]).long()
-    spans = spans[kept].long()
+    low_pixel = low[:, 1].long() * camera.width + low[:, 0].long()
+    spans = spans.long()
     buffer = _nearest_triangles(table, low_pixel, spans, camera.height * camera.width, camera.width)
-    return _hits(buffer, table, kept, low_pixel, inverse_depth, camera.width)
+    return _hits(buffer, table, kept, low_pixel, depths.float(), camera.width)
 
 
 def _nearest_triangles(
@@ -116,7 +119,7 @@ def _hits(
     table: Float[Tensor, "T 9"],
     kept: Int[Tensor, "T"],
     low_pixel: Int[Tensor, "T"],
-    inverse_depth: Float[Tensor, "F 3"],
+    depths: Float[Tensor, "T 3"],
     width: int,
 ) -> Hits:
     """Unpack the z-buffer and compute the barycentric weights of what won."""
@@ -130,7 +133,7 @@ def _hits(
     )
     b1 = (row[:, 2] * x + row[:, 3] * y).clamp(0, 1)
     b2 = torch.minimum((row[:, 4] * x + row[:, 5] * y).clamp_min(0), 1 - b1)
-    weighted = torch.stack([1 - b1 - b2, b1, b2], -1) * inverse_depth[kept[triangle]].float()
+    weighted = torch.stack([1 - b1 - b2, b1, b2], -1) * depths[triangle]
     total = weighted.sum(-1)
     return Hits(pixel, kept[triangle], weighted / total[:, None], 1 / total)
 

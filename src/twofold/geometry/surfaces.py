@@ -126,11 +126,14 @@ def split_edges(
     edges = np.stack([f, np.roll(f, -1, axis=1)], -1).reshape(-1, 2)
     edges.sort(axis=1)
     marked = refine.cpu().numpy()
-    unique, inverse = np.unique(edges, axis=0, return_inverse=True)
-    split = marked[unique].all(axis=1)
-    middle = np.where(split, len(vertices) + np.cumsum(split) - 1, -1)[inverse.reshape(-1)].reshape(-1, 3)
+    split = marked[edges].all(axis=1)
+    unique, inverse = np.unique(edges[split, 0] * len(vertices) + edges[split, 1], return_inverse=True)
+    middle = np.full(len(edges), -1)
+    middle[split] = len(vertices) + inverse
+    middle = middle.reshape(-1, 3)
     old = np.arange(len(vertices))
-    parents = torch.as_tensor(np.concatenate([np.stack([old, old], -1), unique[split]]))
+    halved = np.stack(np.divmod(unique, len(vertices)), -1)
+    parents = torch.as_tensor(np.concatenate([np.stack([old, old], -1), halved]))
     new_faces = torch.as_tensor(_split_triangles(f, middle))
     return vertices[parents.to(vertices.device)].mean(1), new_faces.to(faces.device), parents.to(faces.device)
 

@@ -257,11 +257,11 @@ class FactorizedAvatar(Avatar):
         sampler, k = self.config.sampler, self.config.neighbours
         if isinstance(sampler, ErrorBoundedSampler):
             return self._place_error_bounded(sampler, rays, posed, generator)
-        samples, rows = sample_shell(posed.shell, rays, sampler.step, generator)
+        limit = min(sampler.radius, self.config.outlier_distance / self.scale)
+        samples, nearest, squared = sample_shell(posed.shell, rays, sampler.step, generator, limit)
         points = samples.points(rays).detach()
-        nearest, squared = nearest_vertices(posed.shell, points, rows, k)
-        near = squared[:, 0] < min(sampler.radius, self.config.outlier_distance / self.scale) ** 2
-        samples, nearest, squared, points = samples[near], nearest[near], squared[near], points[near]
+        if k > 1:
+            nearest, squared = nearest_vertices(posed.shell, points, posed.shell.rows_at(points), k)
         shares = neighbour_weights(squared)
         if sampler.least_weight > 0 and len(samples):
             with torch.no_grad():
