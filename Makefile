@@ -6,9 +6,6 @@ OUT ?= demo
 PYTEST_ARGS ?=
 SOURCES := src tests docs/hooks $(wildcard benchmarks)
 
-# Large tensors come and go at every step. Without these, glibc hands their pages back to the kernel each time; other
-# C libraries ignore the variable.
-export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1:glibc.malloc.mmap_threshold=1073741824:glibc.malloc.trim_threshold=4294967296
 # The theme advertises its successor at every build.
 export NO_MKDOCS_2_WARNING := true
 
