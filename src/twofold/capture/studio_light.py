@@ -50,11 +50,12 @@ def thread_beads(vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, 
 
 def _directions() -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "s 3"]]:
     """A few directions over the face of the key light, and some evenly over the upper sky."""
+    golden = np.pi * (3 - np.sqrt(5))
     side = np.cross(KEY, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     up = np.cross(side, KEY)
-    key = np.float32([KEY + 0.09 * (a * side + b * up) for a, b in ((1, 0), (-0.5, 0.87), (-0.5, -0.87))])
-    golden = np.pi * (3 - np.sqrt(5))
+    around = np.arange(7) * golden
+    key = np.float32([KEY + 0.14 * np.sqrt((i + 0.5) / 7) * (np.cos(a) * side + np.sin(a) * up) for i, a in enumerate(around)])
     height, turn = np.linspace(0.95, -0.25, 8), golden * np.arange(8)
     flat = np.sqrt(1 - height**2)
     sky = np.stack([np.cos(turn) * flat, height, np.sin(turn) * flat], -1)

@@ -99,7 +99,7 @@ def _face(p: np.ndarray, color: np.ndarray, a: Anatomy, look: Look) -> np.ndarra
     half = 0.40
     bow = np.sqrt(np.clip(1 - (x / half) ** 2, 0, 1))
     inside = (ax < half) & (np.abs(mouth) < 0.145 * bow)
-    color = _mix(color, lips, 0.85 * inside)
+    color = _mix(color, lips, (0.5 if look.beard else 0.85) * inside)
     color = _mix(color, 0.25 * lips, 0.9 * _line(mouth, 0.035) * (ax < half + 0.03))
     arch = y - 0.36 - 0.10 * np.sin((ax - 0.15) * 2.6).clip(0)
     brow = 1 - smoothstep(0.6, 1.0, 2 * np.abs(arch) / (0.15 * smoothstep(0.95, 0.5, ax) + 0.02))
@@ -244,7 +244,7 @@ def _trousers(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
     outer = (dx > 0) & (np.abs(dz) < 0.12)
     if look.number % 3 == 0:
         color = _mix(color, linear(look.second_color), outer * _line(dz, 0.034))
-    seams = np.maximum(outer * _line(dz - 0.002, 0.005), _line(hem - 0.018, 0.004))
+    seams = np.maximum(outer * _line(dz - 0.002, 0.005) * (look.number % 3 > 0), _line(hem - 0.018, 0.004))
     drop = np.hypot(dx - 0.10, p[:, 1] - j[1, 1] - 0.03)
     seams = np.maximum(seams, (dz > 0.02) * _line(drop - 0.085, 0.005))
     back = np.maximum(np.abs(dx + 0.005) - 0.055, np.abs(p[:, 1] - j[1, 1] + 0.015) - 0.06)

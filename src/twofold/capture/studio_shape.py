@@ -292,6 +292,11 @@ def dress(
     return np.stack(layers, -1).astype(np.float32)
 
 
+def _cut(layer: Float[np.ndarray, "n"], end: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """A layer cut off where `end` is positive, its rim rounded as cloth is."""
+    return 0.5 * (layer + end + np.sqrt((layer - end) ** 2 + 0.006**2))
+
+
 def _shirt(points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy: Anatomy, look: Look) -> np.ndarray:
     j, reach = anatomy.joints, arm_reach(points, anatomy)
     y = points[:, 1]
@@ -303,8 +308,8 @@ def _shirt(points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy: An
     base = np.minimum(loose - offset, tight - 0.006)
     shoulder, elbow, wrist = abs(j[16, 0]), abs(j[18, 0]), abs(j[20, 0])
     end = np.interp(look.sleeve, [0, 1, 2], [shoulder, elbow, wrist])
-    above = np.maximum(-collar(points, anatomy), y - anatomy.joints[15, 1])
-    return np.maximum.reduce([base, np.abs(points[:, 0]) - end, hem - y, above])
+    above = np.maximum(-collar(points, anatomy), y - j[12, 1] - 0.045)
+    return _cut(base, np.maximum.reduce([np.abs(points[:, 0]) - end, hem - y, above]))
 
 
 def _trousers(points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy: Anatomy, look: Look) -> np.ndarray:
@@ -314,7 +319,7 @@ def _trousers(points: np.ndarray, tight: np.ndarray, loose: np.ndarray, anatomy:
     j = anatomy.joints
     end = np.interp(look.trouser, [0, 1, 2], [j[1, 1], j[4, 1], j[7, 1]])
     waist = points[:, 1] - (anatomy.joints[0, 1] + 0.06)
-    return np.maximum.reduce([base, end - points[:, 1], waist])
+    return _cut(base, np.maximum(end - points[:, 1], waist))
 
 
 def _shoes(
@@ -324,7 +329,7 @@ def _shoes(
     ankle, floor = anatomy.joints[7], anatomy.floor
     height = points[:, 1] - floor
     opening = height - 0.085 - 0.25 * (ankle[2] - points[:, 2]).clip(-0.06, 0.05)
-    upper = np.maximum(np.minimum(round_ - 0.013, tight - 0.006), opening)
+    upper = _cut(np.minimum(round_ - 0.013, tight - 0.006), opening)
     # The samples below the ankle fill the footprint, so their distance in the plane is its outline.
     print_ = anatomy.rest[anatomy.rest[:, 1] < floor + 0.05]
     low = points[:, 1] < floor + 0.08
@@ -338,6 +343,7 @@ def _shoes(
 
 _HAIRLINES = {
     "short": ((0.0, 0.5, 0.85, 1.1, 1.3, 1.5, 1.75, 2.1, 3.2), (1.05, 0.95, 0.62, 0.0, 0.05, 0.45, 0.35, -0.5, -1.2)),
+    "back": ((0.0, 0.5, 0.9, 1.25, 1.6, 2.1, 3.2), (1.08, 1.0, 0.78, 0.40, 0.40, -0.45, -1.15)),
     "curtain": ((0.0, 0.45, 0.75, 0.95, 1.5, 3.2), (1.05, 0.85, 0.2, -1.1, -1.6, -1.75)),
     "beanie": ((0.0, 0.9, 1.6, 3.2), (0.72, 0.55, 0.35, 0.0)),
 }
@@ -351,7 +357,7 @@ def _hair(points: np.ndarray, round_: np.ndarray, anatomy: Anatomy, look: Look) 
     away = np.full(len(points), 1.0, np.float32)
     p = points[near] - np.array([0, eyes[1], 0.5 * (eyes[2] + head[2]) - 0.4 * unit], np.float32)
     angle = np.arctan2(np.abs(p[:, 0]), p[:, 2])
-    style = look.hair if look.hair == "beanie" else "curtain" if look.hair == "bob" else "short"
+    style = {"beanie": "beanie", "bob": "curtain", "bun": "back", "ponytail": "back"}.get(look.hair, "short")
     line = (PchipInterpolator(*_HAIRLINES[style])(angle) * unit).astype(np.float32)
     above = p[:, 1] - line
     top = smoothstep(0.5 * unit, 2.0 * unit, p[:, 1])
