@@ -193,7 +193,7 @@ def test_a_mask_without_person_or_world_is_named(tiny, value, sentence):
 
 def test_a_mask_of_somewhere_else_is_named(tiny):
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[:3, :3] = 255
+    mask[:, :2] = 255  # the right rows, the wrong columns
     Image.fromarray(mask).save(tiny / "masks/front/000001.png")
     assert "masks/front/000001.png and the posed body do not meet" in only(validate(tiny))
 

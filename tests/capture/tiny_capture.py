@@ -20,7 +20,8 @@ MOMENTS, HEIGHT, WIDTH = 6, 40, 48
 
 
 def stick_body() -> Body:
-    joints = torch.tensor(JOINTS, dtype=torch.float32)
+    # The pelvis is off the origin, as SMPL's is: what turns about the wrong point shows.
+    joints = torch.tensor(JOINTS, dtype=torch.float32) + torch.tensor([0.04, 0.05, 0.08])
     corners = 0.05 * torch.tensor([[1, 0, -1], [-1, 0, -1], [0, 1, 0], [0, -1, 1]], dtype=torch.float32)
     template = (joints[:, None] + corners).flatten(0, 1)
     tetrahedron = torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from twofold.body.retarget import convert_pose, straighten
 from twofold.body.skeleton import PARENTS, Body
-from twofold.capture.contents import rigid_faults, spans
+from twofold.capture.contents import spans
 from twofold.capture.folder import CaptureWriter
 from twofold.errors import TwofoldError
 from twofold.files import read_npz
@@ -168,8 +168,6 @@ def _read_arrays(source: Path) -> dict[str, np.ndarray]:
             raise TwofoldError(f"{name} in {where} holds a number that is not finite; prepare the capture again.")
     if tuple(arrays["parents"].tolist()) != PARENTS:
         raise TwofoldError(f"The joints in {where} do not hang together as SMPL's 24 do; bring them to that order.")
-    if faults := rigid_faults(arrays["world_to_camera"].astype(np.float64)):
-        raise TwofoldError(f"In {where} {faults[0]}")
     return arrays
 
 
