@@ -56,6 +56,9 @@ def read_smpl(path: Path | str) -> Body:
 
 
 def _assemble(arrays: dict[str, np.ndarray], path: Path) -> Body:
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiu":
+            raise TwofoldError(f"{name} in {path} should hold numbers, it holds {array.dtype}; get the file again.")
     parents = arrays["kintree_table"]
     # The root's parent is stored as 2^32 - 1.
     if parents.shape != (2, len(PARENTS)) or parents[0, 1:].tolist() != list(PARENTS[1:]):
@@ -105,8 +108,8 @@ def _is_zip(path: Path) -> bool:
 def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
     """The needed arrays of an npz; the rest may hold Python objects and is not touched."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in _NEEDED if name in file.files}
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            return {name: archive[name] for name in _NEEDED if name in archive.files}
     except ValueError as error:
         raise TwofoldError(f"{path} holds Python objects, expected plain arrays; use the .pkl file instead.") from error
     except (OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
