@@ -1,7 +1,7 @@
 """One HTML page that shows a run: figures, pictures, curves, tables, videos, and how to go on.
 
-The page needs nothing else but its videos, which lie beside it: style and pictures are inside, there is no script, and it
-follows the reader's choice of light or dark.
+The page needs nothing else but its videos, which lie beside it: style and pictures are inside, there is no script, and
+it follows the reader's choice of light or dark.
 """
 
 import base64
@@ -14,15 +14,23 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
+from urllib.parse import quote
 
-import numpy as np
 from PIL import Image
 
 from twofold.errors import TwofoldError
 from twofold.files import write_bytes
+from twofold.outputs.charts import Chart, Curve, chart_svg
 from twofold.outputs.sheets import Picture, as_bytes
 
+__all__ = [
+    "Chart", "Commands", "Curve", "Figure", "Row", "Section", "Table", "Verdict", "Video",
+    "metrics_table", "number", "verdict", "write_report",
+]  # fmt: skip
+
 FILE_NAME = "report.html"
+MISSING = "\N{EN DASH}"
+"""Shown where there is no number."""
 
 
 @dataclass(frozen=True)
@@ -66,25 +74,6 @@ class Video:
 
     file: str
     caption: str = ""
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Values over steps (or seconds); what is not finite is left out."""
-
-    name: str
-    steps: Sequence[float] | Sequence[int]
-    values: Sequence[float]
-
-
-@dataclass(frozen=True)
-class Chart:
-    """Curves in one pair of axes, `logarithmic` in height where asked for."""
-
-    title: str
-    curves: tuple[Curve, ...]
-    x_label: str = "step"
-    logarithmic: bool = False
 
 
 @dataclass(frozen=True)
@@ -170,9 +159,9 @@ def verdict(
     sign, goal = ("≥", at_least) if at_least is not None else ("≤", at_most)
     wanted = "" if goal is None else f"goal {sign} {goal:g} {unit}".strip()
     if not isinstance(value, int | float) or not math.isfinite(value):
-        return Verdict(label, "–", "", wanted, None if goal is None else False)
+        return Verdict(label, MISSING, "", wanted, None if goal is None else False)
     met = None if goal is None else (value >= goal if at_least is not None else value <= goal)
-    return Verdict(label, number(value), unit, wanted, met)
+    return Verdict(label, f"{value:.{0 if abs(value) >= 100 else 2}f}", unit, wanted, met)
 
 
 def metrics_table(metrics: Mapping[str, object]) -> Table:
@@ -192,7 +181,7 @@ def number(value: float | int) -> str:
     """
     if isinstance(value, int) or abs(value) >= 1000:
         return f"{value:,.0f}"
-    if value != 0 and abs(value) < 1e-3:
+    if 0 < abs(value) < 1e-3:
         return f"{value:.1e}"
     return f"{value:.{1 if abs(value) >= 100 else 2 if abs(value) >= 1 else 4}f}"
 
@@ -209,20 +198,17 @@ def _found(metrics: Mapping[str, object], key: str) -> object:
 
 def _metric_rows(metrics: Mapping[str, object], heading: str) -> Iterator[tuple[str, ...]]:
     """Plain values first, under their section's heading, then the sections within."""
-    plain = {
-        k: v for k, v in metrics.items() if not isinstance(v, list) and (not isinstance(v, Mapping) or "value" in v)
-    }
+    sections = {k: v for k, v in metrics.items() if isinstance(v, Mapping) and "value" not in v}
+    plain = {k: v for k, v in metrics.items() if k not in sections and not isinstance(v, list)}
     if plain and heading:
         yield (heading,)
     for key, entry in plain.items():
-        value = entry["value"] if isinstance(entry, Mapping) else entry
-        protocol = str(entry.get("protocol", "")) if isinstance(entry, Mapping) else ""
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        yield key, number(value) if is_number else "–" if value is None else str(value), protocol
-    for key, entry in metrics.items():
-        if isinstance(entry, Mapping) and key not in plain:
-            name = key.replace("_", " ").capitalize()
-            yield from _metric_rows(entry, f"{heading}, {name.lower()}" if heading else name)
+        value, protocol = (entry["value"], entry.get("protocol", "")) if isinstance(entry, Mapping) else (entry, "")
+        shown = number(value) if isinstance(value, float) or type(value) is int else value
+        yield key, MISSING if shown is None else str(shown), str(protocol)
+    for key, entry in sections.items():
+        name = key.replace("_", " ").capitalize()
+        yield from _metric_rows(entry, f"{heading}, {name.lower()}" if heading else name)
 
 
 def _section(section: Section) -> str:
@@ -241,7 +227,7 @@ def _part(part: Part) -> str:
     if isinstance(part, Video):
         return _film(part)
     if isinstance(part, Chart):
-        return _chart(part)
+        return f"<figure>{_legend(part)}{chart_svg(part)}</figure>"
     if isinstance(part, Table):
         return _table(part)
     lines = [f"<div><p>{_text(what)}</p><pre>{html.escape(line)}</pre></div>" for line, what in part.lines]
@@ -265,7 +251,13 @@ def _figure(figure: Figure) -> str:
 def _film(video: Video) -> str:
     caption = f"<figcaption>{_text(video.caption)}</figcaption>" if video.caption else ""
     attributes = "controls autoplay loop muted playsinline"
-    return f'<figure><video src="{html.escape(video.file)}" {attributes}></video>{caption}</figure>'
+    return f'<figure><video src="{quote(video.file)}" {attributes}></video>{caption}</figure>'
+
+
+def _legend(chart: Chart) -> str:
+    names = [curve.name for curve in chart.curves] if len(chart.curves) > 1 else []
+    spans = "".join(f"<span class=c{i % 5}>{_text(name)}</span>" for i, name in enumerate(names))
+    return f"<figcaption><b>{_text(chart.title)}</b>{spans}</figcaption>"
 
 
 def _embedded(picture: Path | Picture) -> str:
@@ -302,74 +294,6 @@ def _paragraphs(text: str) -> str:
     return "".join(f"<p>{_text(paragraph)}</p>" for paragraph in re.split(r"\n\s*\n", text.strip()) if paragraph)
 
 
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 480, 260, 54, 10, 10, 40
-BINS = 160
-"""Curves with more points are drawn as the mean of bins, over the range that each bin spans."""
-
-
-def _chart(chart: Chart) -> str:
-    """A drawing in SVG; its colours come from the page's style."""
-    curves = [(c.name, _points(c, chart.logarithmic)) for c in chart.curves]
-    everything = np.concatenate([np.empty((0, 2)), *(p for _, p in curves)])
-    names = "".join(
-        f"<span class=c{i % 5}>{_text(name)}</span>" for i, (name, _) in enumerate(curves) if len(curves) > 1
-    )
-    caption = f"<figcaption><b>{_text(chart.title)}</b>{names}</figcaption>"
-    if not len(everything):
-        return f"<figure>{caption}<p>Nothing was recorded.</p></figure>"
-    (x_low, y_low), (x_high, y_high) = everything.min(0), everything.max(0)
-    spare = 0.04 * (y_high - y_low) or 0.5
-    y_low, y_high, x_high = y_low - spare, y_high + spare, max(x_high, x_low + 1e-9)
-
-    def place(points: np.ndarray) -> str:
-        x = LEFT + (points[:, 0] - x_low) / (x_high - x_low) * (WIDTH - LEFT - RIGHT)
-        y = HEIGHT - BOTTOM - (points[:, 1] - y_low) / (y_high - y_low) * (HEIGHT - TOP - BOTTOM)
-        return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
-
-    drawn: list[str] = []
-    for value, label in _ticks(y_low, y_high, chart.logarithmic):
-        y = place(np.array([[x_low, value]])).split(",")[1]
-        drawn.append(f'<path class=grid d="M{LEFT},{y}H{WIDTH - RIGHT}"/>')
-        drawn.append(f"<text x={LEFT - 8} y={y} dy=.35em text-anchor=end>{label}</text>")
-    for value, label in _ticks(x_low, x_high):
-        x = place(np.array([[value, y_low]])).split(",")[0]
-        drawn.append(f"<text x={x} y={HEIGHT - BOTTOM + 20} text-anchor=middle>{label}</text>")
-    for i, (_, points) in enumerate(curves):
-        bins = np.array_split(points, BINS) if len(points) > BINS else [points[j : j + 1] for j in range(len(points))]
-        if len(points) > BINS:
-            upper, lower = (np.array([[b[:, 0].mean(), f(b[:, 1])] for b in bins]) for f in (np.max, np.min))
-            drawn.append(f'<polygon class="c{i % 5} range" points="{place(np.concatenate([upper, lower[::-1]]))}"/>')
-        drawn.append(f'<polyline class=c{i % 5} points="{place(np.array([b.mean(0) for b in bins]))}"/>')
-    drawn.append(f"<text x={WIDTH - RIGHT} y={HEIGHT - 4} text-anchor=end>{_text(chart.x_label)}</text>")
-    picture = (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role=img aria-label="{html.escape(chart.title)}">{"".join(drawn)}</svg>'
-    )
-    return f"<figure>{caption}{picture}</figure>"
-
-
-def _points(curve: Curve, logarithmic: bool) -> np.ndarray:
-    """(step, value or its logarithm) of what can be drawn."""
-    points = np.array([curve.steps, curve.values], dtype=float).T.reshape(-1, 2)
-    points = points[np.isfinite(points).all(1)]
-    if logarithmic:
-        points = points[points[:, 1] > 0]
-        points[:, 1] = np.log10(points[:, 1])
-    return points
-
-
-def _ticks(low: float, high: float, logarithmic: bool = False) -> list[tuple[float, str]]:
-    """Round positions between two ends (of the logarithm, where asked for) and what to write there."""
-    if logarithmic and high - low > 0.7:
-        steps = (1,) if high - low > 2.5 else (1, 2, 5)
-        marks = [s * 10.0**e for e in range(math.floor(low), math.ceil(high) + 1) for s in steps]
-        return [(math.log10(m), f"{m:g}") for m in marks if low <= math.log10(m) <= high]
-    rough = (high - low) / 4
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(s * power for s in (1, 2, 5, 10) if s * power >= rough)
-    values = [i * step for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
-    return [(v, f"{10**v:.3g}" if logarithmic else f"{v:,.10g}" if abs(v) < 1e6 else f"{v:g}") for v in values]
-
-
 LOGO = (
     "<svg viewBox='0 0 24 24' aria-hidden=true><path d='M3 5l9-3v17l-9 3z' opacity=.55 />"
     "<path d='M12 2l9 3v17l-9-3z'/></svg>"
@@ -394,7 +318,8 @@ header p:not(.brand){color:var(--faint);margin:0 0 8px;max-width:62ch}
 section{padding:36px 0 12px;border-top:1px solid var(--line);margin-top:36px}
 section>p{max-width:72ch;margin:0 0 12px}
 a{color:var(--accent)}
-code,pre,td:first-child{font-family:ui-monospace,SFMono-Regular,Menlo,Consolas,"DejaVu Sans Mono",monospace;font-size:.88em}
+code,pre,td:first-child{font-family:ui-monospace,SFMono-Regular,Menlo,Consolas,"DejaVu Sans Mono",monospace;
+font-size:.88em}
 figure{margin:0;min-width:0}
 img,video{display:block;width:100%;height:auto;border-radius:8px;background:#fff;outline:1px solid var(--line)}
 figcaption{color:var(--faint);font-size:14px;line-height:1.4;margin-top:7px}
@@ -402,7 +327,8 @@ figcaption{color:var(--faint);font-size:14px;line-height:1.4;margin-top:7px}
 .verdicts>div{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:14px 16px}
 .verdicts dt{color:var(--faint);font-size:14px;line-height:1.3}
 .verdicts dd{margin:0}
-.value{font-size:30px;font-weight:650;letter-spacing:-.02em;line-height:1.3;font-variant-numeric:tabular-nums}
+.value{font-size:30px;font-weight:650;letter-spacing:-.02em;line-height:1.3;white-space:nowrap;
+font-variant-numeric:tabular-nums}
 .value small{font-size:15px;font-weight:400;letter-spacing:0;color:var(--faint)}
 .goal{font-size:13px;color:var(--faint)}
 .met .goal{color:var(--good)}.missed .goal{color:var(--bad)}
@@ -420,7 +346,7 @@ svg text{font-size:13px;fill:var(--faint);font-variant-numeric:tabular-nums}
 polyline{fill:none;stroke:var(--c);stroke-width:2;stroke-linejoin:round;stroke-linecap:round}
 .range{fill:var(--c);opacity:.16}
 table{border-collapse:collapse;width:100%;margin:12px 0;font-size:15px}
-th,td{text-align:left;padding:7px 14px 7px 0;border-bottom:1px solid var(--line);vertical-align:top}
+th,td{text-align:left;padding:7px 14px 7px 0;border-bottom:1px solid var(--line);vertical-align:baseline}
 thead th{color:var(--faint);font-weight:500;font-size:14px}
 .group th{padding-top:20px;font-weight:600}
 td:nth-child(2){font-variant-numeric:tabular-nums;font-weight:600;white-space:nowrap}
@@ -431,8 +357,8 @@ user-select:all}
 footer{padding-top:28px;padding-bottom:48px;color:var(--faint);font-size:14px}
 footer p{margin:0;max-width:80ch}
 @media(max-width:760px){header,main,footer{padding-left:18px;padding-right:18px}header{padding-top:28px}
-.split{grid-template-columns:1fr;gap:26px}.lead{max-width:340px}section{margin-top:22px;padding-top:26px}
-.verdicts{grid-template-columns:1fr 1fr}.value{font-size:25px}
+.split{grid-template-columns:1fr;gap:26px}.lead{max-width:420px}section{margin-top:22px;padding-top:26px}
+.verdicts{grid-template-columns:1fr 1fr}.value{font-size:25px}svg text{font-size:17px}
 .strip{grid-auto-columns:minmax(148px,1fr);overflow-x:auto;margin-left:-18px;margin-right:-18px;padding:2px 18px 6px}
 thead{display:none}tr{display:grid;grid-template-columns:1fr auto;border-bottom:1px solid var(--line);padding:7px 0}
 th,td{border:0;padding:0}td:nth-child(3){grid-column:1/-1;font-size:14px}.group{border:0;padding-top:18px}}
