@@ -143,3 +143,22 @@ def evaluate(
     metrics |= extra or {}
     write_json(folder / "metrics.json", metrics)
     return metrics
+
+
+def with_protocols(metrics: dict[str, object]) -> dict[str, object]:
+    """The figures for a table: each number of a section beside its protocol, general remarks as a line of their own."""
+    out: dict[str, object] = {}
+    for section, values in metrics.items():
+        if not isinstance(values, dict):
+            out[section] = values
+            continue
+        protocol = values.get("protocol", {})
+        lines: dict[str, object] = {}
+        for name, value in values.items():
+            if name != "protocol":
+                own = protocol.get(name, "") if isinstance(protocol, dict) else protocol
+                lines[name] = {"value": value, "protocol": own}
+        if isinstance(protocol, dict):
+            lines |= {name: {"value": "", "protocol": text} for name, text in protocol.items() if name not in values}
+        out[section] = lines
+    return out
