@@ -10,6 +10,7 @@ from torch import Tensor
 
 from twofold.body.skeleton import Body, pose_body, shape_body
 from twofold.capture.types import Frame
+from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Rays, pixel_rays, project
 
 
@@ -82,7 +83,11 @@ class PixelSource:
         self._pictures: dict[int, _Picture] = {}
 
     def picture(self, which: int) -> _Picture:
-        """The frame's picture and the pixels that may be drawn."""
+        """The frame's picture and the pixels that may be drawn.
+
+        Raises:
+            TwofoldError: its mask shows nobody.
+        """
         if which not in self._pictures:
             self._pictures[which] = self._read(self.frames[which])
         return self._pictures[which]
@@ -91,6 +96,11 @@ class PixelSource:
         mask = frame.mask()
         image = frame.image() * mask[..., None] + self._background * (1 - mask[..., None])
         inside = mask > 0.5
+        if not inside.any():
+            raise TwofoldError(
+                f"{frame.mask_file} shows nobody: no pixel is brighter than 127 of 255; make the mask again or "
+                "leave the picture out of the training frames."
+            )
         height, width = mask.shape
         # Pixels whose ray may meet the body: the projected vertices, grown by the margin.
         body = pose_body(self._shaped, frame.pose, frame.translation)
@@ -100,7 +110,7 @@ class PixelSource:
         touched = np.ones((height, width), dtype=bool)
         touched[shown[:, 1].numpy(), shown[:, 0].numpy()] = False
         touched &= ~inside.numpy()
-        away = ndimage.distance_transform_edt(touched)
+        away = np.asarray(ndimage.distance_transform_edt(touched))
         focal = float(frame.camera.intrinsics[0, 0]) / max(float(depth.median()), 1e-3)
         reachable = torch.from_numpy(away <= self.margin * focal)
         if self.config.surroundings is None:
@@ -108,7 +118,8 @@ class PixelSource:
             subject = torch.zeros_like(inside)
             subject[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
         else:
-            subject = torch.from_numpy(ndimage.distance_transform_edt(~inside.numpy()) <= self.config.surroundings)
+            off = np.asarray(ndimage.distance_transform_edt(~inside.numpy()))
+            subject = torch.from_numpy(off <= self.config.surroundings)
         subject &= reachable
         return _Picture(
             (image * 255).round().to(torch.uint8),
@@ -140,14 +151,13 @@ class PixelSource:
         index = torch.cat(chosen)
         position = torch.stack([index % width, index // width], -1).float()
         rays = pixel_rays(self.frames[which].camera, position)
-        batch = Batch(
+        return Batch(
             rays=Rays(*(t.to(device) for t in (rays.origins, rays.directions, rays.near, rays.far))),
             color=(picture.image.flatten(0, 1)[index].float() / 255).to(device),
             mask=(picture.mask.flatten()[index].float() / 255).to(device),
             singles=config.rays,
             patch_pixels=patches.to(device),
         )
-        return batch
 
     def _patch(self, picture: _Picture, reachable: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Pixels of one patch and their places in it; those that cannot meet the body are left out."""

@@ -1,7 +1,7 @@
 """The shell: the part of space close to a posed body, as a voxel list that knows each voxel's nearest vertices.
 
-The body is the prior of everything here. A ray is sampled only where it runs through the shell, and the nearest vertex of
-a sample is sought only among the few that its voxel lists, instead of among all of them.
+The body is the prior of everything here. A ray is sampled only where it runs through the shell, and the nearest vertex
+of a sample is sought only among the few that its voxel lists, instead of among all of them.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from twofold.deform import shell_kernels
@@ -75,13 +75,13 @@ def build_shell(
     seeds = np.ones(shape, dtype=bool)
     seeds[tuple(((surface - low) / voxel).astype(int).T)] = False
     # A voxel is off the surface's own voxel by at most one diagonal, so this keeps a superset of the true shell.
-    away = ndimage.distance_transform_edt(seeds)
+    away = np.asarray(ndimage.distance_transform_edt(seeds))
     reach = radius / voxel + np.sqrt(3)
     near = np.argwhere(away <= reach)
     centers = (low + (near + 0.5) * voxel).astype(np.float32)
-    distance, nearest = cKDTree(points, balanced_tree=False, compact_nodes=False).query(
-        centers, k=candidates, workers=-1, distance_upper_bound=float("inf")
-    )
+    tree = KDTree(points, balanced_tree=False, compact_nodes=False)
+    listed = min(candidates, len(points))
+    distance, nearest = (np.reshape(a, (-1, listed)) for a in tree.query(centers, k=listed, workers=-1))
     keep = distance[:, 0] <= radius + np.sqrt(3) / 2 * voxel
     row = -1 - np.maximum(away - reach, 0).astype(np.int32)
     row[tuple(near[keep].T)] = np.arange(keep.sum(), dtype=np.int32)
@@ -96,7 +96,7 @@ def build_shell(
     )
 
 
-def nearest_vertices(
+def nearest_listed(
     shell: Shell, points: Float[Tensor, "S 3"], rows: Int[Tensor, "S"], k: int
 ) -> tuple[Int[Tensor, "S k"], Float[Tensor, "S k"]]:
     """The k nearest vertices of points in the shell and their squared distances (metres squared), nearest first.
@@ -147,12 +147,11 @@ def sample_shell(
 def _walk_compiled(
     shell: Shell, rays: Rays, start: Tensor, step: float, limit: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    given = [t.contiguous().numpy() for t in (rays.origins, rays.directions, rays.near, rays.far, start)]
-    walls = (np.float32(step), shell.low.numpy(), shell.voxel, shell.row.numpy(), shell.nearest.numpy())
-    vertices = shell.vertices.numpy()
-    parts = in_parts(
-        len(rays), lambda begin, end: shell_kernels.walk(*given, *walls, vertices, limit, begin, end), least=64
-    )
+    arrays = (t.contiguous().numpy() for t in (rays.origins, rays.directions, rays.near, rays.far, start))
+    origins, directions, near, far, first = arrays
+    given = (origins, directions, near, far, first, np.float32(step), shell.low.numpy(), shell.voxel, shell.row.numpy())
+    more = (shell.nearest.numpy(), shell.vertices.numpy(), limit)
+    parts = in_parts(len(rays), lambda begin, end: shell_kernels.walk(*given, *more, begin, end), least=64)
     ray, depth, nearest, squared = (torch.from_numpy(np.concatenate(part)) for part in zip(*parts, strict=True))  # type: ignore[misc]
     return ray, depth, nearest, squared
 
@@ -167,6 +166,6 @@ def _walk_in_torch(
     points = rays.origins[:, None] + depth[..., None] * rays.directions[:, None]
     rows = shell.rows_at(points)
     ray, position = ((rows >= 0) & (depth < rays.far[:, None])).nonzero(as_tuple=True)
-    nearest, squared = nearest_vertices(shell, points[ray, position], rows[ray, position], 1)
+    nearest, squared = nearest_listed(shell, points[ray, position], rows[ray, position], 1)
     close = squared[:, 0] < limit**2
     return ray[close], depth[ray, position][close], nearest[close, 0], squared[close, 0]

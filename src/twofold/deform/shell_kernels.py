@@ -1,4 +1,6 @@
-"""The compiled walk of rays through a shell, for CPUs; `shell.sample_shell` holds the same in PyTorch as its slow twin."""
+"""The compiled walk of rays through a shell, for CPUs; `shell` holds its twin in PyTorch, for GPUs and for tests."""
+
+# pyright: reportMissingParameterType=false
 
 import numba
 import numpy as np

@@ -38,7 +38,7 @@ def vertex_transforms(body: PosedBody) -> Float[Tensor, "V 3 4"]:
 
 
 def neighbour_weights(squared_distances: Float[Tensor, "S K"]) -> Float[Tensor, "S K"]:
-    """Share of each of the K nearest vertices, exp(-min(d^2, 4)) normalised (metres squared), as Vid2Avatar defines it."""
+    """Share of each of the K nearest vertices as Vid2Avatar defines it: exp(-min(d^2, 4)), d in metres, normalised."""
     return torch.softmax(-squared_distances.clamp_max(4.0), -1)
 
 
@@ -50,9 +50,9 @@ def to_canonical(
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 3"]]:
     """`inverse_skinning` with the weights of the nearest vertices, and the matrix for normals.
 
-    Blending vertices' weights is blending their transforms, so the K rows are mixed and inverted once. With one neighbour
-    the transforms are inverted at the vertices instead, of which there are fewer than samples. Which vertices are nearest
-    and their shares carry no gradient; the pose gets its gradient through `forward`.
+    Blending vertices' weights is blending their transforms, so the K rows are mixed and inverted once. With one
+    neighbour the transforms are inverted at the vertices instead, of which there are fewer than samples. Which vertices
+    are nearest and their shares carry no gradient; the pose gets its gradient through `forward`.
 
     Args:
         x_posed: points of observation space, metres.

@@ -1,7 +1,7 @@
 """The two-branch field on feature grids: the paper's idea at a price that a laptop can pay.
 
-The low branch sees only coarse grid levels and the body; the high branch sees fine levels, the pose, and the low branch's
-features. Distances, colours, gates and losses are those of the network form in `factorized`.
+The low branch sees only coarse grid levels and the body; the high branch sees fine levels, the pose, and the low
+branch's features. Distances, colours, gates and losses are those of the network form in `factorized`.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from twofold.body.skeleton import PosedBody
-from twofold.field.grids import FeatureGrid, Lattices, body_distance, build_lattices, interpolate, interpolation_pullback
+from twofold.field.grids import (
+    FeatureGrid,
+    Lattices,
+    body_distance,
+    build_lattices,
+    interpolate,
+    interpolation_pullback,
+)
 from twofold.field.output import FieldOutput
 
 
@@ -37,7 +44,7 @@ class GridFieldConfig:
     radius: float = 0.1
     """Features exist this far from the canonical body, metres; at least the shell's radius."""
     gate_width: float | None = 0.05
-    """Distance from the low branch's surface at which the high branch has half its effect, metres; none for plain sums."""
+    """Distance from the low branch's surface at which the high branch has half its effect, metres; none: plain sums."""
     branches: Literal["both", "low", "high", "high_rendered"] = "both"
     """Which branches exist and are rendered; all but "both" are ablations."""
     share_features: bool = True
@@ -53,7 +60,9 @@ class GridFieldConfig:
 class SmallNet(nn.Module):
     """Two hidden layers whose input gradient is a second, hand-written pass."""
 
-    def __init__(self, inputs: int, width: int, outputs: int, condition: int, generator: torch.Generator | None) -> None:
+    def __init__(
+        self, inputs: int, width: int, outputs: int, condition: int, generator: torch.Generator | None
+    ) -> None:
         """He-initialised layers; the last one starts near zero, so a branch starts as a small correction."""
         super().__init__()
         self.first = nn.Linear(inputs, width)
@@ -147,8 +156,9 @@ class GridField(nn.Module):
     def _geometry(self, x: Tensor, pose: Tensor, slopes: Literal["none", "constant", "trained"]) -> _Geometry:
         """Distances and features of both branches; `slopes` says whether their gradients by x are wanted too."""
         g = _Geometry(self.pose_code(pose) if hasattr(self, "pose_code") else None)
-        lattices = Lattices(self.prior_rows, self.prior_place, self.prior_shape)
-        prior = interpolate(self.prior, x, lattices)[:, 0]
+        body = self.get_buffer("prior")
+        lattices = Lattices(*(self.get_buffer(f"prior_{name}") for name in ("rows", "place", "shape")))
+        prior = interpolate(body, x, lattices)[:, 0]
         tape = tape2 = (x, x)
         if self.has_low:
             g.low = self.low_grid(x)
@@ -173,7 +183,7 @@ class GridField(nn.Module):
             # The reverse pass, by hand: head, networks, grids.
             head = torch.zeros(len(x), 1 + self.config.shared, dtype=x.dtype, device=x.device)
             head[:, 0] = 0.1
-            slope = interpolation_pullback(self.prior, x, torch.ones_like(prior)[:, None], lattices)
+            slope = interpolation_pullback(body, x, torch.ones_like(prior)[:, None], lattices)
             if self.has_low:
                 g.g1 = slope + self.low_grid.pullback(x, self.low_sdf.pullback(tape, head)[:, : self.low_grid.size])
                 g.g = g.g1

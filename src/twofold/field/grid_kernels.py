@@ -2,9 +2,11 @@
 
 Legend: S points, L levels, C features; `x` [S 3] points; `table` [N C] features of all levels; `rows` the table row of
 every lattice node, all levels one after the other; `place` [L 4] lower corner and inverse spacing; `shape` [L 4] nodes
-along each axis and where the level begins in `rows`; `begin`, `end` the part of the points (of the levels, in the scatters,
-which own their rows) that a call handles.
+along each axis and where the level begins in `rows`; `begin`, `end` the part of the points (of the levels, in the
+scatters, which own their rows) that a call handles.
 """
+
+# pyright: reportMissingParameterType=false
 
 import numba
 import numpy as np

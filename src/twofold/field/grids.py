@@ -1,21 +1,21 @@
 """Feature grids around the canonical body: a trilinear encoding whose coarse levels carry low frequencies only.
 
-A level is a regular lattice of feature vectors, kept only at the nodes near the body. Its spacing bounds the frequencies
-that it can hold just as the octaves of a Fourier encoding do (half a period per cell), and eight lookups cost far less
-than a wide network.
+A level is a regular lattice of feature vectors, kept only at the nodes near the body. Its spacing bounds the
+frequencies that it can hold just as the octaves of a Fourier encoding do (half a period per cell), and eight lookups
+cost far less than a wide network.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import ndimage
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from twofold.field import grid_kernels as kernels
+from twofold.geometry.surfaces import nearest_vertices, vertex_normals
 from twofold.geometry.threads import in_parts
 
 
@@ -50,7 +50,8 @@ def build_lattices(
         shape = np.ceil((points.max(0) + reach + voxel - low) / voxel).astype(int) + 1
         empty = np.ones(shape, dtype=bool)
         empty[tuple(np.round((points - low) / voxel).astype(int).T)] = False
-        nodes = np.argwhere(ndimage.distance_transform_edt(empty) * voxel <= reach + voxel)
+        away = np.asarray(ndimage.distance_transform_edt(empty))
+        nodes = np.argwhere(away * voxel <= reach + voxel)
         row = np.full(shape, count, dtype=np.int32)
         row[tuple(nodes.T)] = np.arange(count + 1, count + 1 + len(nodes), dtype=np.int32)
         rows.append(row.ravel())
@@ -82,7 +83,7 @@ def corners(x: Float[Tensor, "S 3"], lattices: Lattices, level: int) -> tuple[In
 def interpolate_in_torch(
     table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], lattices: Lattices
 ) -> Float[Tensor, "S LC"]:
-    """`interpolate` by ordinary PyTorch operations, with all derivatives: the path of GPUs, and the compiled form's twin."""
+    """`interpolate` by ordinary PyTorch operations, with all derivatives: for GPUs, and the compiled form's twin."""
     features = []
     for level in range(len(lattices.place)):
         index, part = corners(x, lattices, level)
@@ -118,7 +119,7 @@ def _arrays(lattices: Lattices) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, table: Tensor, x: Tensor, lattices: Lattices) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, table: Tensor, x: Tensor, lattices: Lattices) -> Tensor:  # type: ignore[override]
         ctx.save_for_backward(table, x)
         ctx.lattices = lattices
         out = np.empty((len(x), table.shape[1] * len(lattices.place)), dtype=np.float32)
@@ -127,7 +128,7 @@ class _Interpolate(torch.autograd.Function):
         return torch.from_numpy(out)
 
     @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # type: ignore[override]
         table, x = ctx.saved_tensors
         points, slopes, arrays = x.contiguous().numpy(), gradient.contiguous().numpy(), _arrays(ctx.lattices)
         by_table = by_x = None
@@ -144,7 +145,7 @@ class _Interpolate(torch.autograd.Function):
 
 class _Pullback(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, table: Tensor, x: Tensor, cotangent: Tensor, lattices: Lattices) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, table: Tensor, x: Tensor, cotangent: Tensor, lattices: Lattices) -> Tensor:  # type: ignore[override]
         x, cotangent = x.detach().contiguous(), cotangent.detach().contiguous()
         ctx.save_for_backward(table, x, cotangent)
         ctx.lattices = lattices
@@ -154,7 +155,7 @@ class _Pullback(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, None, Tensor | None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, Tensor | None, None]:  # type: ignore[override]
         table, x, cotangent = ctx.saved_tensors
         arrays, slopes = _arrays(ctx.lattices), gradient.contiguous().numpy()
         by_table = by_cotangent = None
@@ -220,18 +221,6 @@ class FeatureGrid(nn.Module):
         return interpolation_pullback(self.table, x, cotangent, self.lattices)
 
 
-def vertex_normals(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "V 3"]:
-    """Unit normals, outward, each face weighted by its area."""
-    corners = vertices[faces]
-    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], face)
-    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-
-
 def body_distance(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "n"]:
@@ -240,11 +229,12 @@ def body_distance(
     The offsets to the nearest vertices, projected on their normals and averaged: exact to a few millimetres near the
     surface, which is all that a prior needs.
     """
-    normals = vertex_normals(vertices, faces)
-    distance, nearest = cKDTree(vertices).query(points, k=6, workers=-1)
-    along = ((points[:, None] - vertices[nearest]) * normals[nearest]).sum(-1)
-    shares = 1 / np.maximum(distance, 1e-4) ** 2
+    x, corners = torch.from_numpy(points), torch.from_numpy(vertices)
+    distance, nearest = nearest_vertices(x, corners, k=min(6, len(corners)))
+    normals = vertex_normals(corners, torch.from_numpy(faces))
+    along = ((x[:, None] - corners[nearest]) * normals[nearest]).sum(-1)
+    shares = 1 / distance.clamp_min(1e-4) ** 2
     mean = (along * shares).sum(-1) / shares.sum(-1)
     # Close to the surface the projection is the distance; further out the nearest vertex says how far.
-    far = np.sign(mean) * distance[:, 0]
-    return np.where(distance[:, 0] < 0.02, mean, far).astype(np.float32)
+    far = mean.sign() * distance[:, 0]
+    return torch.where(distance[:, 0] < 0.02, mean, far).float().numpy()

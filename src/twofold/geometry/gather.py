@@ -1,9 +1,11 @@
 """Weighted sums of table rows: one primitive behind skinning and feature grids.
 
-`out[s] = sum_k weights[s, k] * table[index[s, k]]` is the product of a sparse matrix with the table, and its gradient the
-product with the transpose. Autograd's own gradient scatters row by row; on a CPU SciPy's transposed product is five to
-ten times faster, and it sums in a fixed order, so a run repeats to the bit.
+`out[s] = sum_k weights[s, k] * table[index[s, k]]` is the product of a sparse matrix with the table, and its gradient
+the product with the transpose. Autograd's own gradient scatters row by row; on a CPU SciPy's transposed product is five
+to ten times faster, and it sums in a fixed order, so a run repeats to the bit.
 """
+
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -15,7 +17,7 @@ from torch.nn import functional as F
 
 class _WeightedRows(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, table: Tensor, index: Tensor, weights: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, table: Tensor, index: Tensor, weights: Tensor) -> Tensor:  # type: ignore[override]
         ctx.save_for_backward(index, weights)
         ctx.rows = table.shape[0]
         if index.shape[1] == 1:
@@ -23,7 +25,7 @@ class _WeightedRows(torch.autograd.Function):
         return F.embedding_bag(index, table, mode="sum", per_sample_weights=weights)
 
     @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, None]:  # type: ignore[override]
         index, weights = ctx.saved_tensors
         return scatter_rows(gradient, index, weights, ctx.rows), None, None
 

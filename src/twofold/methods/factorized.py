@@ -16,7 +16,7 @@ from twofold import losses
 from twofold.body.skeleton import PosedBody, ShapedBody, pose_body, shape_body
 from twofold.capture.pixels import Batch
 from twofold.deform.pose_refinement import PoseRefinement
-from twofold.deform.shell import Shell, build_shell, nearest_vertices, sample_shell
+from twofold.deform.shell import Shell, build_shell, nearest_listed, sample_shell
 from twofold.deform.skinning import neighbour_weights, to_canonical, vertex_transforms
 from twofold.field.factorized import FactorizedFieldConfig
 from twofold.field.factorized_grid import GridFieldConfig
@@ -261,7 +261,7 @@ class FactorizedAvatar(Avatar):
         samples, nearest, squared = sample_shell(posed.shell, rays, sampler.step, generator, limit)
         points = samples.points(rays).detach()
         if k > 1:
-            nearest, squared = nearest_vertices(posed.shell, points, posed.shell.rows_at(points), k)
+            nearest, squared = nearest_listed(posed.shell, points, posed.shell.rows_at(points), k)
         shares = neighbour_weights(squared)
         if sampler.least_weight > 0 and len(samples):
             with torch.no_grad():

@@ -96,7 +96,9 @@ def body_up(posed: PosedAvatar) -> Float[Tensor, "3"]:
     return torch.nn.functional.normalize(joints[12] - joints[[7, 8]].mean(0), dim=0)
 
 
-def orbit(posed: PosedAvatar, size: int, views: int, up: Float[Tensor, "3"] | None = None, start: float = 0.0) -> Iterator[Camera]:
+def orbit(
+    posed: PosedAvatar, size: int, views: int, up: Float[Tensor, "3"] | None = None, start: float = 0.0
+) -> Iterator[Camera]:
     """Cameras on a circle around a posed body, at its middle's height, the whole body in view.
 
     Args:

@@ -1,0 +1,41 @@
+"""A range cut into parts: nothing twice, nothing left out, in order."""
+
+import threading
+from itertools import chain
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from twofold.geometry.threads import in_parts
+
+
+@pytest.fixture(params=[1, 3])
+def threads(request, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: request.param)
+    return request.param
+
+
+@given(count=st.integers(0, 5000), least=st.integers(0, 2000), allowed=st.integers(1, 4))
+def test_parts_cover_the_range_once_and_in_order(count, least, allowed):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch, "get_num_threads", lambda: allowed)
+        parts = in_parts(count, lambda begin, end: (begin, end), least)
+    assert list(chain.from_iterable(range(*part) for part in parts)) == list(range(count))
+    assert 1 <= len(parts) <= allowed
+    assert len(parts) == 1 or min(end - begin for begin, end in parts) >= least
+
+
+def test_parts_run_side_by_side(threads):
+    everyone = threading.Barrier(threads, timeout=20)
+    assert sorted(in_parts(threads, lambda begin, end: (everyone.wait(), begin)[1], least=1)) == list(range(threads))
+
+
+def test_an_error_in_a_part_is_raised(threads):
+    def work(begin, end):
+        if end == 10:
+            raise ValueError("the last part")
+
+    with pytest.raises(ValueError, match="the last part"):
+        in_parts(10, work, least=1)
