@@ -64,6 +64,7 @@ def import_capture(
     out: Annotated[Path, tyro.conf.Positional],
     held_out: int = 10,
     drop_below_iou: float = 0.0,
+    held_objects: Literal["keep", "remove"] = "remove",
 ) -> None:
     """Makes a capture folder from one that was prepared elsewhere (images, masks, capture.npz).
 
@@ -72,10 +73,11 @@ def import_capture(
         out: Folder to make.
         held_out: Of so many frames one is kept for testing.
         drop_below_iou: Leaves out frames whose fitted body covers the mask worse than this, 0 to 1.
+        held_objects: Whether what is thick and sticks out of the body, such as a ball, leaves the masks.
     """
     from twofold.capture.prepared import import_prepared
 
-    import_prepared(source, out, held_out, drop_below_iou)
+    import_prepared(source, out, held_out, drop_below_iou, held_objects=held_objects)
     _say(f"The capture is in {out}.", f"twofold train {out}")
 
 

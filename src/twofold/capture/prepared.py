@@ -6,20 +6,22 @@ T-pose. The world is turned from the camera's axes to y up.
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
 from twofold.body.retarget import convert_pose, straighten
-from twofold.body.skeleton import PARENTS, Body
+from twofold.body.skeleton import PARENTS, Body, PosedBody, pose_body, shape_body
 from twofold.capture.contents import spans
 from twofold.capture.folder import CaptureWriter
+from twofold.capture.masks import body_silhouette, remove_held_objects
 from twofold.errors import TwofoldError
 from twofold.files import read_npz
-from twofold.geometry.cameras import Camera
+from twofold.geometry.cameras import Camera, project
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 
 CAMERA = "cam"
@@ -58,6 +60,7 @@ def import_prepared(
     drop_below_iou: float = 0.0,
     origin: Origin | None = None,
     overwrite: bool = False,
+    held_objects: Literal["keep", "remove"] = "remove",
 ) -> Path:
     """Makes a capture folder from a prepared one. One camera trains; held-out frames become the novel poses.
 
@@ -68,6 +71,7 @@ def import_prepared(
         drop_below_iou: frames whose fitted body covers the mask worse than this are in no split; the notes name them.
         origin: frames per second and credit; None takes those of `ORIGINS`, else 30 and no credit.
         overwrite: a capture that lies at `out` gives way.
+        held_objects: whether what is thick and sticks out of the body, such as a ball, is taken out of the masks.
 
     Returns:
         `out`.
@@ -90,9 +94,17 @@ def import_prepared(
     held_out = [time for time in kept if time % every_held_out == every_held_out // 2]
     origin = origin or ORIGINS.get(source.name, Origin(30.0, ""))
     with CaptureWriter(out, overwrite) as writer:
+        cleaned: list[int] = []
+        shaped = shape_body(body, torch.zeros(0))
         for time in kept:
             writer.image_file(CAMERA, time, images[time])
-            writer.mask_file(CAMERA, time, masks[time])
+            posed = pose_body(shaped, poses[time].float(), translations[time].float())
+            mask = _without_objects(masks[time], posed, camera) if held_objects == "remove" else None
+            if mask is None:
+                writer.mask_file(CAMERA, time, masks[time])
+            else:
+                writer.mask(CAMERA, time, mask)
+                cleaned.append(time)
         writer.finish(
             name=source.name,
             body=body,
@@ -111,11 +123,26 @@ def import_prepared(
                 "every_held_out": every_held_out,
                 "drop_below_iou": drop_below_iou,
                 "left_out": left_out,
+                "held_objects_removed": cleaned,
                 "video_frame": arrays["video_frame"].tolist(),
                 "silhouette_iou": [round(float(iou), 3) for iou in arrays["silhouette_iou"]],
             },
         )
     return out
+
+
+def _without_objects(file: Path, posed: PosedBody, camera: Camera) -> UInt8[np.ndarray, "h w"] | None:
+    """A mask without held objects, or None where there is nothing to remove."""
+    with Image.open(file) as picture:
+        mask = np.asarray(picture.convert("L"))
+    if mask.shape != (camera.height, camera.width):
+        return None  # The writer tells what is wrong with it.
+    pixels, depth = project(camera, posed.vertices)
+    if depth.min() <= 0:
+        return None
+    body = body_silhouette(pixels.numpy(), posed.faces.numpy(), camera.height, camera.width)
+    kept = remove_held_objects(mask > 127, body, float(camera.intrinsics[0, 0] / depth.median()))
+    return None if (kept == (mask > 127)).all() else np.where(kept | (mask <= 127), mask, 0).astype(np.uint8)
 
 
 def turn_world(
