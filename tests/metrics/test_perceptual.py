@@ -100,13 +100,15 @@ def test_gradients_reach_the_pictures_and_not_the_weights():
     assert all(not p.requires_grad for p in model.parameters())
 
 
-def test_black_pictures_have_finite_gradients():
+def test_pictures_without_features_have_zero_distance_and_finite_gradients():
     model = small()
     for convolution in model.blocks.modules():
         if isinstance(convolution, torch.nn.Conv2d):
             convolution.bias.fill_(-100.0)
     first = torch.zeros(1, 3, 16, 16, requires_grad=True)
-    model(first, torch.zeros(1, 3, 16, 16)).sum().backward()
+    distance = model(first, torch.zeros(1, 3, 16, 16)).sum()
+    distance.backward()
+    assert distance.item() == 0
     assert first.grad.isfinite().all()
 
 

@@ -233,6 +233,17 @@ def test_shaded_samples_render_the_ball_as_fine_ones_do():
     assert (opacity[0] - opacity[1]).abs().mean() < 0.02
 
 
+@pytest.mark.parametrize("scale", [1e-3, 0.02, 1.0])
+def test_error_bound_is_the_printed_one_cut_off_before_it_overflows(scale):
+    depths = torch.tensor([[0.0, 0.1, 0.3, 0.4, 0.55, 0.9]], dtype=torch.float64)
+    distances = torch.tensor([[0.5, 0.3, 0.08, -0.04, 0.05, 0.2]], dtype=torch.float64)
+    delta = depths.diff(dim=1)
+    clearances = surface_clearance(delta, distances)
+    found = error_bound(delta, distances, clearances, torch.tensor([scale], dtype=torch.float64))
+    expected = literal_bounds(depths[0].tolist(), distances[0].tolist(), scale)
+    torch.testing.assert_close(found[0], torch.tensor(expected, dtype=torch.float64))
+
+
 def test_no_rays_give_no_samples():
     rays = some_rays()[torch.arange(0)]
     assert len(SMALL.sample(rays, ball, torch.tensor(0.1, dtype=torch.float64), None, False)) == 0

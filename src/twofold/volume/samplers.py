@@ -86,8 +86,8 @@ def surface_clearance(delta: Float[Tensor, "R m"], sdf: Float[Tensor, "R n"]) ->
     b, c = sdf[:, :-1].abs(), sdf[:, 1:].abs()
     half = (delta + b + c) / 2
     square = half * (half - delta) * (half - b) * (half - c)
-    height = 2 * square.clamp_min(0).sqrt() / delta.clamp_min(1e-12)
-    clearance = torch.where(b + c > delta, height, torch.zeros_like(b))
+    # Balls that do not meet (b + c < delta) make the square negative: nothing is known between them.
+    clearance = 2 * square.clamp_min(0).sqrt() / delta.clamp_min(1e-12)
     clearance = torch.where(delta.square() + c.square() <= b.square(), c, clearance)
     clearance = torch.where(delta.square() + b.square() <= c.square(), b, clearance)
     return torch.where(sdf[:, :-1].sign() * sdf[:, 1:].sign() == 1, clearance, torch.zeros_like(b))
