@@ -197,7 +197,7 @@ def test_what_was_not_measured_is_a_dash_and_meets_no_goal(key: str) -> None:
     missing = verdict(METRICS, key, "x", "cm", at_most=1.0)
     assert missing == Verdict("x", "\N{EN DASH}", "", "goal ≤ 1 cm", False)
     assert verdict(METRICS, key, "x").met is None
-    assert verdict({"a": math.nan}, "a", "x", at_most=1.0).met is False
+    assert verdict({"a": math.nan}, "a", "x", "cm", at_most=1.0) == missing
 
 
 def test_every_number_stands_beside_its_protocol() -> None:
