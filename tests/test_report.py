@@ -105,7 +105,7 @@ def full_page(folder: Path) -> Page:
             Section("Go on", "", (Commands((("twofold render run --size <n>", "Larger."),)),)),
         ],
         subtitle="40 frames",
-        verdicts=[Verdict("Novel view", "27.3", "dB", "goal", True), Verdict("Pose", "20.1", "dB", "goal", False)],
+        verdicts=[Verdict("Novel view", "27.3", "dB", "26 dB", True), Verdict("Pose", "20.1", "dB", "24 dB", False)],
         lead=Figure(picture(2)),
         credit="By nobody.",
     )
@@ -117,7 +117,7 @@ def test_page_shows_all_it_was_given(tmp_path: Path) -> None:
     page = full_page(tmp_path)
     titles = ["Seed 3", "40 frames", "Unseen views", "Camera 2", "By nobody.", "twofold render run --size <n>"]
     captions = ["truth", "avatar", "once around", "total", "part"]
-    figures = ["27.3 dB", "✓ goal", "✗ goal", "psnr_box", "over the box"]
+    figures = ["27.3 dB", "✓ 26 dB", "✗ 24 dB", "psnr_box", "over the box"]
     for words in titles + captions + figures:
         assert words in page.text, words
     assert len(page.all("svg")) == 1 + 2, "the logo and two charts"
