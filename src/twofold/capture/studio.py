@@ -20,13 +20,13 @@ from scipy import sparse
 from twofold.body.anny import anny_body
 from twofold.body.skeleton import Body, PosedBody, ShapedBody, pose_body, shape_body
 from twofold.capture.folder import CaptureWriter
+from twofold.capture.studio_figure import Figure, build_figure
 from twofold.capture.studio_folds import Fold, displacement, lay_folds
 from twofold.capture.studio_light import Beads, cast_shade, illuminate, thread_beads
 from twofold.capture.studio_look import Look, draw_look
 from twofold.capture.studio_motion import choreograph
 from twofold.capture.studio_paint import paint
 from twofold.capture.studio_scene import ring, room, spoil_mask
-from twofold.capture.studio_shape import Figure, build_figure
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.raster import box_filter, rasterize, supersampled
@@ -62,7 +62,9 @@ class StudioConfig:
         limits = {"size": (16, 4096), "frames": (4, 100_000), "cameras": (1, 100), "samples": (1, 16)}
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
-                raise TwofoldError(f"{name} of a studio capture should be {low} to {high}, it is {getattr(self, name)}.")
+                raise TwofoldError(
+                    f"{name} of a studio capture should be {low} to {high}, it is {getattr(self, name)}."
+                )
         for name in ("pose_noise", "mask_noise"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TwofoldError(f"{name} of a studio capture should be 0 to 1, it is {getattr(self, name)}.")
@@ -166,11 +168,12 @@ def photograph(
     hits = rasterize(
         supersampled(camera, samples), torch.from_numpy(moment.vertices), torch.from_numpy(figure.faces), cull=True
     )
-    corners, weights = figure.faces[hits.face.numpy()], hits.barycentric.numpy()
     table = np.concatenate(
         [figure.rest, moment.normals, moment.vertices, figure.layers, moment.key[:, None], moment.sky[:, None]], 1
     )
-    sample = sum(weights[:, i, None] * table[corners[:, i]] for i in range(3))
+    corners = torch.from_numpy(figure.faces).index_select(0, hits.face)
+    rows = [torch.from_numpy(table).index_select(0, corners[:, i]) * hits.barycentric[:, i, None] for i in range(3)]
+    sample = (rows[0] + rows[1] + rows[2]).numpy()
     normals = sample[:, 3:6] / np.linalg.norm(sample[:, 3:6], axis=1, keepdims=True).clip(1e-9)
     to_camera = camera.center.numpy() - sample[:, 6:9]
     to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
@@ -234,7 +237,7 @@ def plan_splits(frames: int, cameras: int) -> dict[str, dict[str, list[int]]]:
     others = names[1:] or names
     return {
         "train": {names[0]: list(range(rehearsed))},
-        "novel_view": {name: seen for name in names[1:]},
+        "novel_view": dict.fromkeys(names[1:], seen),
         "novel_pose": {name: list(range(rehearsed, frames)) for name in others},
     }
 
@@ -244,10 +247,10 @@ def _outline(performer: Performer) -> Float[np.ndarray, "n 3"]:
     moments = zip(performer.poses, performer.translations, strict=True)
     joints = torch.stack([_posed(performer.shaped, p, t).joints for p, t in moments]).numpy()
     head = performer.figure.vertices[:, 1].max() - performer.figure.anatomy.joints[15, 1]
-    up = np.float32([0, 1, 0])
+    right, up, ahead = np.eye(3, dtype=np.float32)
     feet, hands = joints[:, [7, 8, 10, 11]], joints[:, 22:]
-    ends = [joints[:, 15] + head * up, feet * (1 - up), *(hands + 0.1 * d for d in np.float32(np.eye(3)))]
-    ends += [hands - 0.1 * d for d in np.float32(np.eye(3))] + [feet + [0.1, 0, 0], feet - [0.1, 0, 0]]
+    ends = [joints[:, 15] + head * up, feet * (1 - up), feet + 0.1 * right, feet - 0.1 * right]
+    ends += [hands + reach * way for way in (right, up, ahead) for reach in (-0.1, 0.1)]
     return np.concatenate([end.reshape(-1, 3) for end in ends]).astype(np.float32)
 
 
@@ -260,7 +263,9 @@ def _film(
     progress: Callable[[float], None],
 ) -> None:
     """Every picture, mask and mesh, one moment after the other, several at once."""
-    rooms = {name: room(camera, config.seed) for name, camera in cameras.items()} if config.background != "black" else {}
+    rooms = (
+        {name: room(camera, config.seed) for name, camera in cameras.items()} if config.background != "black" else {}
+    )
     wanted: dict[int, set[str]] = {time: set() for time in range(config.frames)}
     for split in splits.values():
         for name, times in split.items():

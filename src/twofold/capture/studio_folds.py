@@ -10,7 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from twofold.capture.studio_shape import SHIRT, TROUSERS, Figure, smoothstep
+from twofold.capture.studio_anatomy import smoothstep
+from twofold.capture.studio_clothes import SHIRT, TROUSERS
+from twofold.capture.studio_figure import Figure
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,13 @@ _RISE = 0.0055
 def bending(pose: Float[np.ndarray, "24 3"]) -> Float[np.ndarray, "d"]:
     """How strongly each driver of the folds acts, from 0 (not at all) to about 1.
 
-    In order, left then right: elbow, arm down, arm forward, arm up, knee, hip; then the trunk: forward, backward, to the
-    left, to the right, wound to the left, wound to the right; and 1 for folds that are always there.
+    In order: left elbow, arm down, arm forward, arm up; the same of the right; left knee, hip; the same of the right;
+    the trunk forward, backward, to the left, to the right, wound to the left, to the right; 1 for what always is.
     """
     drivers: list[float] = []
     for side, collar in ((1, 13), (-1, 14)):
         turn = Rotation.from_rotvec(pose[collar]) * Rotation.from_rotvec(pose[collar + 3])
-        x, y, z = turn.apply([side, 0, 0])
+        _, y, z = turn.apply([side, 0, 0])
         elbow = np.linalg.norm(pose[collar + 5])
         drivers += [elbow / 1.7, max(-y, 0.0) ** 1.5, max(z, 0.0), max(y + 0.1, 0.0)]
     for hip in (1, 2):
@@ -82,7 +84,9 @@ def lay_folds(figure: Figure, seed: int) -> tuple[Fold, ...]:
         mine = shirt * (p[:, 0] * side > 0)
         d = (p - elbow) * [side, 1, 1]
         inner = smoothstep(-0.8, 0.9, figure.normals[:, 2])
-        add(mine * np.exp(-((d[:, 0] / 0.075) ** 2)) * (0.35 + 0.65 * inner), d[:, 0] + 0.2 * d[:, 1], 0.028, first, 1.0)
+        add(
+            mine * np.exp(-((d[:, 0] / 0.075) ** 2)) * (0.35 + 0.65 * inner), d[:, 0] + 0.2 * d[:, 1], 0.028, first, 1.0
+        )
         d = (p - shoulder) * [side, 1, 1]
         around = np.exp(-(((d[:, 0] + 0.03) / 0.10) ** 2) - ((d[:, 1] + 0.05) / 0.12) ** 2)
         add(mine * around, 0.72 * d[:, 0] - 0.70 * d[:, 1], 0.034, first + 1)

@@ -1,4 +1,4 @@
-"""Light that stays where it is while the person turns: a key light, a sky, a rim light, and what they throw in shade."""
+"""Light that stays where it is while the person turns: key light, sky, rim light, and their shadows."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import sparse
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from twofold.capture.studio_paint import Paint
 
@@ -16,20 +16,20 @@ def _unit(*xyz: float) -> Float[np.ndarray, "3"]:
 
 
 KEY, RIM = _unit(-0.55, 0.75, 0.62), _unit(0.75, 0.35, -0.62)
-KEY_COLOR = np.float32([1.02, 0.96, 0.88])
-RIM_COLOR = np.float32([0.30, 0.33, 0.40])
-SKY, GROUND = np.float32([0.46, 0.49, 0.54]), np.float32([0.27, 0.25, 0.23])
+KEY_COLOR = np.array([1.02, 0.96, 0.88], np.float32)
+RIM_COLOR = np.array([0.30, 0.33, 0.40], np.float32)
+SKY, GROUND = np.array([0.46, 0.49, 0.54], np.float32), np.array([0.27, 0.25, 0.23], np.float32)
 
 _CELL = 0.016
 _BIAS = 0.020
 _GAP = 0.009
-"""Cells of the grids seen from the lights, how far behind its front a point is still lit, and between points; metres."""
+"""Cells of the grids seen from the lights, how far behind the front a point is lit, and distance of points; metres."""
 
 
 class Beads(NamedTuple):
     """Vertices spread evenly over the surface, for which light is worked out, and the way back to all vertices."""
 
-    index: Int[np.ndarray, "b"]
+    chosen: Int[np.ndarray, "b"]
     spread: sparse.csr_matrix
 
 
@@ -38,7 +38,7 @@ def thread_beads(vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, 
     cubes = np.floor((vertices - vertices.min(0)) / _GAP).astype(np.int64)
     key = (cubes[:, 0] * 4096 + cubes[:, 1]) * 4096 + cubes[:, 2]
     index = np.unique(key, return_index=True)[1]
-    distance, near = cKDTree(vertices[index]).query(vertices, k=4)
+    distance, near = KDTree(vertices[index]).query(vertices, k=4)
     # Light on the other side of a thin part is none of a vertex's business.
     alike = (normals[index][near] * normals[:, None]).sum(-1).clip(0.02)
     weight = alike / (distance + 0.003)
@@ -55,11 +55,13 @@ def _directions() -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "s 3"]]:
     side /= np.linalg.norm(side)
     up = np.cross(side, KEY)
     around = np.arange(7) * golden
-    key = np.float32([KEY + 0.14 * np.sqrt((i + 0.5) / 7) * (np.cos(a) * side + np.sin(a) * up) for i, a in enumerate(around)])
+    key = np.array(
+        [KEY + 0.14 * np.sqrt((i + 0.5) / 7) * (np.cos(a) * side + np.sin(a) * up) for i, a in enumerate(around)]
+    )
     height, turn = np.linspace(0.95, -0.25, 8), golden * np.arange(8)
     flat = np.sqrt(1 - height**2)
     sky = np.stack([np.cos(turn) * flat, height, np.sin(turn) * flat], -1)
-    return key / np.linalg.norm(key, axis=1, keepdims=True), sky.astype(np.float32)
+    return (key / np.linalg.norm(key, axis=1, keepdims=True)).astype(np.float32), sky.astype(np.float32)
 
 
 def cast_shade(
@@ -71,7 +73,7 @@ def cast_shade(
     bead well behind the front of its cell lies in shade.
     """
     key_directions, sky_directions = _directions()
-    v, n = torch.from_numpy(vertices[beads.index]), torch.from_numpy(normals[beads.index])
+    v, n = torch.from_numpy(vertices[beads.chosen]), torch.from_numpy(normals[beads.chosen])
     key = torch.zeros(len(v))
     for direction in torch.from_numpy(key_directions):
         key += _lit(v, direction) / len(key_directions)
@@ -137,4 +139,6 @@ def to_srgb(light: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
     """Linear light to sRGB; what is brighter than white approaches it softly."""
     bright = np.maximum(light - 0.75, 0)
     soft = np.where(light > 0.75, 0.75 + 0.25 * (1 - np.exp(-4 * bright)), np.maximum(light, 0))
-    return np.where(soft <= 0.0031308, 12.92 * soft, 1.055 * np.maximum(soft, 1e-8) ** (1 / 2.4) - 0.055).astype(np.float32)
+    return np.where(soft <= 0.0031308, 12.92 * soft, 1.055 * np.maximum(soft, 1e-8) ** (1 / 2.4) - 0.055).astype(
+        np.float32
+    )

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 @dataclass(frozen=True)
 class Arm:
-    """Degrees. `raise_` from hanging (0) over level (90) to upright (180), `forward` from sideways (0) to ahead (90)."""
+    """Degrees: `raise_` from hanging (0) to upright (180), `forward` from sideways (0) to ahead (90)."""
 
     raise_: float = 14
     forward: float = 20
@@ -31,7 +31,10 @@ class Leg:
 
 @dataclass(frozen=True)
 class Stance:
-    """One natural pose; degrees. `bow` ahead, `lean` to the left, `wind` turns the chest to the left; the same for the head."""
+    """One natural pose, in degrees.
+
+    The trunk can `bow` ahead, `lean` to the left and `wind` to the left; the head can `nod` and `look` to the left.
+    """
 
     left_arm: Arm = Arm()
     right_arm: Arm = Arm()

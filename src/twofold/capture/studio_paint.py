@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from twofold.capture.studio_anatomy import Anatomy, arm_reach, smoothstep
+from twofold.capture.studio_clothes import HAIR, SHIRT, SHOES, SKIN, SOLES, TROUSERS, collar
 from twofold.capture.studio_look import Color, Look
-from twofold.capture.studio_shape import HAIR, SHIRT, SHOES, SKIN, SOLES, TROUSERS, Anatomy, arm_reach, collar, smoothstep
 
 
 @dataclass(frozen=True)
@@ -122,10 +123,12 @@ def _eye(x: np.ndarray, y: np.ndarray, color: np.ndarray, look: Look) -> np.ndar
     r = np.hypot(x, y - 0.012)
     iris = linear(look.eye_color)
     color = _mix(color, iris * (0.6 + 0.5 * (r < 0.085))[:, None], (open_ & (r < 0.105)).astype(np.float32))
-    color = _mix(color, np.float32([[0.005, 0.005, 0.006]]), (open_ & (r < 0.048)).astype(np.float32))
-    color = _mix(color, np.float32([[0.95, 0.95, 0.95]]), (np.hypot(x + 0.035, y - 0.05) < 0.02).astype(np.float32))
+    color = _mix(color, np.array([[0.005, 0.005, 0.006]], np.float32), (open_ & (r < 0.048)).astype(np.float32))
+    color = _mix(
+        color, np.array([[0.95, 0.95, 0.95]], np.float32), (np.hypot(x + 0.035, y - 0.05) < 0.02).astype(np.float32)
+    )
     lash = _line(y - upper - 0.012, 0.045) * (np.abs(x) < width + 0.02)
-    color = _mix(color, np.float32([[0.02, 0.015, 0.012]]), 0.95 * lash)
+    color = _mix(color, np.array([[0.02, 0.015, 0.012]], np.float32), 0.95 * lash)
     color = _mix(color, color * 0.55, 0.6 * _line(y - lower + 0.008, 0.02) * (np.abs(x) < width))
     crease = _line(y - upper - 0.085, 0.03) * (np.abs(x) < width)
     return _mix(color, color * 0.6, 0.5 * crease)
@@ -165,9 +168,11 @@ def _shirt(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
         pocket = np.maximum(np.abs(x - 0.085) - 0.045, np.abs(y - j[9, 1] + 0.01) - 0.05)
         color = _mix(color, first * 0.45, front * _line(pocket, 0.006))
         spot = np.hypot(x, ((y - a.crotch) % 0.075) - 0.0375)
-        color = _mix(color, np.float32([[0.75, 0.72, 0.65]]), (front & (spot < 0.0075)).astype(np.float32))
+        color = _mix(color, np.array([[0.75, 0.72, 0.65]], np.float32), (front & (spot < 0.0075)).astype(np.float32))
         color = _mix(
-            color, np.float32([[0.1, 0.09, 0.08]]), (front & (np.abs(spot - 0.0085) < 0.0015)).astype(np.float32)
+            color,
+            np.array([[0.1, 0.09, 0.08]], np.float32),
+            (front & (np.abs(spot - 0.0085) < 0.0015)).astype(np.float32),
         )
         color = _mix(color, second, 0.8 * band)
     else:
@@ -211,7 +216,7 @@ _SEGMENTS = (
     0b1111111,
     0b1111011,
 )
-"""Seven-segment digits; bits from the highest: top, upper left, upper right, middle, lower left, lower right, bottom."""
+"""Seven-segment digits; from the highest bit: top, upper left and right, middle, lower left and right, bottom."""
 
 
 def _digits(x: np.ndarray, y: np.ndarray, number: int) -> np.ndarray:
@@ -262,7 +267,7 @@ def _shoes(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
     color = _mix(color, 0.7 * trim, (ahead > 0.155).astype(np.float32))
     laces = (np.abs(across) < 0.028) & (ahead > 0.045) & (ahead < 0.135) & (height > 0.035)
     color = _mix(color, base * 0.55, laces)
-    color = _mix(color, np.float32([[0.85, 0.85, 0.83]]), laces & ((ahead / 0.018) % 1 < 0.45))
+    color = _mix(color, np.array([[0.85, 0.85, 0.83]], np.float32), laces & ((ahead / 0.018) % 1 < 0.45))
     stripe = (
         (np.abs(across) > 0.03) & (np.abs(ahead - 0.02 - 0.6 * height) % 0.035 < 0.012) & (np.abs(ahead - 0.05) < 0.05)
     )

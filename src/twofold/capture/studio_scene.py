@@ -91,7 +91,8 @@ def spoil_mask(
     if strength <= 0:
         return mask
     size = mask.shape[0]
-    inside = ndimage.distance_transform_edt(mask >= 0.5) - ndimage.distance_transform_edt(mask < 0.5)
+    within, without = (np.asarray(ndimage.distance_transform_edt(m)) for m in (mask >= 0.5, mask < 0.5))
+    inside = within - without
     waves = ndimage.gaussian_filter(random.normal(size=mask.shape), max(size * 0.012, 0.8))
     inside = inside + 0.012 * size * strength * waves / max(waves.std(), 1e-6)
     rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 
@@ -36,11 +36,11 @@ def nearest_vertices(
     points: Float[Tensor, "n 3"], vertices: Float[Tensor, "V 3"], k: int = 1
 ) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
     """Distances (metres) to the `k` nearest vertices and their indices, nearest first. Exact; not differentiable."""
-    tree = cKDTree(vertices.detach().cpu().numpy())
-    distances, indices = tree.query(points.detach().cpu().numpy(), k=list(range(1, k + 1)))
+    tree = KDTree(vertices.detach().cpu().numpy())
+    distances, indices = tree.query(points.detach().cpu().numpy(), k=k)
     return (
-        torch.as_tensor(distances, dtype=points.dtype, device=points.device),
-        torch.as_tensor(indices, dtype=torch.int64, device=points.device),
+        torch.as_tensor(distances, dtype=points.dtype, device=points.device).view(-1, k),
+        torch.as_tensor(indices, dtype=torch.int64, device=points.device).view(-1, k),
     )
 
 
@@ -79,7 +79,7 @@ def point_to_mesh(
     corners = vertices[faces]
     centers = corners.mean(1)
     reach = float((corners - centers[:, None]).norm(dim=-1).max())
-    tree = cKDTree(centers.detach().cpu().numpy())
+    tree = KDTree(centers.detach().cpu().numpy())
     distances = torch.full_like(points[:, 0], torch.inf)
     triangles = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     nearest = torch.zeros_like(points)
@@ -87,15 +87,15 @@ def point_to_mesh(
     k = min(8, len(faces))
     while len(open_points):
         here = points[open_points]
-        away, index = tree.query(here.detach().cpu().numpy(), k=list(range(1, k + 1)))
-        index = torch.as_tensor(index, dtype=torch.int64, device=points.device)
+        away, index = tree.query(here.detach().cpu().numpy(), k=k)
+        index = torch.as_tensor(index, dtype=torch.int64, device=points.device).view(-1, k)
         a, b, c = corners[index].unbind(-2)
         feet = closest_on_triangles(here[:, None].expand_as(a), a, b, c)
         best, which = (feet - here[:, None]).norm(dim=-1).min(-1)
         distances[open_points] = best
         triangles[open_points] = index.gather(1, which[:, None])[:, 0]
         nearest[open_points] = feet[torch.arange(len(here), device=points.device), which]
-        last = torch.as_tensor(away[:, -1], dtype=points.dtype, device=points.device)
+        last = torch.as_tensor(away.reshape(-1, k)[:, -1], dtype=points.dtype, device=points.device)
         open_points = open_points[(last - reach < best) & (k < len(faces))]
         k = min(4 * k, len(faces))
     return distances, triangles, nearest
