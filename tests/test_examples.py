@@ -1,6 +1,7 @@
 """The examples in the docstrings print what they say.
 
-They are found in the source text: once shapes are checked, a function is a wrapper that doctest takes for someone else's.
+They are found in the source text: once shapes are checked, a function is a wrapper, which doctest takes for someone
+else's and passes over.
 """
 
 import ast

@@ -8,25 +8,24 @@ import sys
 from pathlib import Path
 
 import citations
+import examples
 import pytest
 import torch
 from jaxtyping import TypeCheckError
 
+from twofold.config import to_dict
 from twofold.geometry.cameras import Rays
 from twofold.geometry.rotations import axis_angle_to_matrix
+from twofold.recipes import paper, released
 
 ROOT = Path(__file__).resolve().parents[1]
 CODE = sorted(file for folder in ("src", "tests", "docs/hooks", "benchmarks") for file in (ROOT / folder).rglob("*.py"))
 TEXTS = CODE + [
     file
-    for folder in (".", ".ci", "docs")
+    for folder in (".", ".ci", "docs", "docs/reference")
     for file in sorted((ROOT / folder).iterdir())
     if file.is_file() and file.suffix in {".md", ".toml", ".yml", ".yaml", ".txt", ".html", ".css", ""}
 ]
-
-
-def module_names() -> list[str]:
-    return sorted(citations.modules())
 
 
 def test_files_import_only_from_lower_floors():
@@ -54,7 +53,21 @@ def test_equation_table_has_a_linked_row_for_each_citation(tmp_path):
     (folder / "field.py").write_text(function + method)
     rows = citations.equation_table(tmp_path).splitlines()[2:]
     assert [row.split(" | ")[0].strip("| ") for row in rows] == ["2", "4", "6"]
-    assert rows[2].endswith("[`field.Field.combine`][twofold.field.Field.combine] |")
+    assert rows[2].endswith("| `field.py` | [`Field.combine`][twofold.field.Field.combine] |")
+
+
+def test_every_module_is_on_a_page_of_the_reference():
+    pages = "".join(file.read_text() for file in (ROOT / "docs" / "reference").glob("*.md"))
+    shown = {
+        line.removeprefix("::: ") for line in citations.on_page_markdown(pages).splitlines() if line.startswith("::: ")
+    }
+    files = {name for name, file in citations.modules().items() if file.name != "__init__.py"}
+    assert shown == files
+
+
+def test_examples_in_the_reference_stand_between_fences():
+    text = "What.\n\n    >>> f()\n    [1, 2]\n\nArgs:\n    x: y"
+    assert examples.fenced(text) == "What.\n\n    ```pycon\n    >>> f()\n    [1, 2]\n    ```\n\nArgs:\n    x: y"
 
 
 def test_wrong_shape_of_an_argument_raises():
@@ -68,7 +81,7 @@ def test_shapes_of_a_dataclass_that_disagree_raise():
         Rays(torch.zeros(5, 3), torch.zeros(5, 3), torch.zeros(5), torch.zeros(4))
 
 
-@pytest.mark.parametrize("name", [name for name in module_names() if not name.endswith("__init__")])
+@pytest.mark.parametrize("name", sorted(citations.modules()))
 def test_public_functions_say_what_they_do(name):
     silent = [
         full
@@ -105,12 +118,26 @@ def test_nothing_is_unpickled_through_numpy():
     assert not guilty
 
 
-def test_options_in_the_paper_page_exist():
+def options_in_the_paper_page():
     text = (ROOT / "docs" / "paper.md").read_text()
-    keys = set(re.findall(r"`method\.([\w.]+?)[`=]", text)) | set(re.findall(r" method\.([\w.]+?)=", text))
-    assert len(keys) > 30
-    from twofold.methods.factorized import FactorizedConfig
+    return set(re.findall(r"[` ]((?:method|training)\.[\w.]+)[`=]", text))
 
-    default = FactorizedConfig()
-    for key in sorted(keys):
-        functools.reduce(getattr, key.split("."), default)
+
+def test_options_in_the_paper_page_exist():
+    for key in sorted(options_in_the_paper_page()):
+        functools.reduce(getattr, key.split("."), released())
+
+
+def test_every_difference_of_paper_and_release_is_an_option_in_the_paper_page():
+    first, second = settings_of(to_dict(paper())), settings_of(to_dict(released()))
+    different = {key for key in first.keys() | second.keys() if first.get(key) != second.get(key)}
+    assert different - {"name"} <= options_in_the_paper_page()
+    assert len(different) > 10
+
+
+def settings_of(config, prefix=""):
+    """Every setting by its dotted key."""
+    leaves = {}
+    for key, value in config.items():
+        leaves |= settings_of(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return leaves

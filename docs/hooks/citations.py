@@ -1,7 +1,8 @@
 """What the source says about itself, for the documentation: its equations and its modules.
 
 MkDocs calls `on_page_markdown` for each page. `<!-- equations -->` becomes a table of the paper's equations and the
-functions that hold them, `<!-- modules -->` the reference of every module. `tests/test_house.py` uses the same reader.
+functions that hold them, `<!-- modules twofold.body -->` the reference of the modules in that package (not in packages
+inside of it). `tests/test_house.py` uses the same reader.
 """
 
 import ast
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 SOURCE = Path(__file__).resolve().parents[2] / "src"
+MODULES = re.compile(r"<!-- modules ([\w.]+) -->")
 CITATION = re.compile(r"\(Eqs?\. (\d+(?:, \d+)*)\)")
 EQUATIONS = {
     1: "inverse skinning: an observed point goes home to canonical space",
@@ -68,19 +70,23 @@ def citations(source: Path = SOURCE) -> list[Citation]:
 
 
 def equation_table(source: Path = SOURCE) -> str:
-    """Markdown: number, meaning, and a link to the function."""
-    rows = ["| Eq. | What it says | Function |", "|---|---|---|"]
+    """Markdown: number, meaning, file, and a link to the function."""
+    rows = ["| Eq. | What it says | File | Function |", "|---|---|---|---|"]
     for cited in citations(source):
-        short = cited.name.removeprefix("twofold.")
-        rows.append(f"| {cited.number} | {EQUATIONS[cited.number]} | [`{short}`][{cited.name}] |")
+        file = cited.file.relative_to(source / "twofold")
+        function = cited.name.removeprefix("twofold." + ".".join(file.with_suffix("").parts) + ".")
+        link = f"[`{function}`][{cited.name}]"
+        rows.append(f"| {cited.number} | {EQUATIONS[cited.number]} | `{file.as_posix()}` | {link} |")
     return "\n".join(rows)
 
 
-def module_reference(source: Path = SOURCE) -> str:
-    """Markdown: what mkdocstrings needs to show each module; an empty package is left out."""
-    return "\n\n".join(f"::: {name}" for name, file in modules(source).items() if "__init__" not in file.name)
+def module_reference(package: str, source: Path = SOURCE) -> str:
+    """Markdown: what mkdocstrings needs to show each module of a package."""
+    files = [name for name, file in modules(source).items() if file.name != "__init__.py"]
+    return "\n\n".join(f"::: {name}" for name in files if name.rpartition(".")[0] == package)
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
     """MkDocs hook: fill the two marks."""
-    return markdown.replace("<!-- equations -->", equation_table()).replace("<!-- modules -->", module_reference())
+    markdown = markdown.replace("<!-- equations -->", equation_table())
+    return MODULES.sub(lambda mark: module_reference(mark[1]), markdown)
