@@ -3,7 +3,7 @@
 The reference form (error-bounded sampler, gradients by autograd) renders a small picture; its seconds for a large one are
 stated as rays times its seconds a ray, since it would take an hour.
 
-    python benchmarks/rendering.py [--threads 2] [--steps 300]
+    python -m benchmarks.rendering [--threads 2] [--steps 300]
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from common import peak_memory_gb, store, studio_capture, timed
-from step import at_work, reference
+from benchmarks.common import peak_memory_gb, store, studio_capture, timed
+from benchmarks.step import at_work, reference
 
 from twofold.capture.types import Capture
 from twofold.methods.base import Avatar, Subject

@@ -4,7 +4,7 @@ The reference form is how the field does it now: error-bounded sampler, every in
 by automatic differentiation through automatic differentiation, float32. Ours samples the shell around the posed body and
 takes the gradients by a hand-written reverse pass. Both have the same networks, losses (without LPIPS) and 1,728 rays.
 
-    python benchmarks/step.py [--threads 2] [--repeats 5] [--reference-repeats 1]
+    python -m benchmarks.step [--threads 2] [--repeats 5] [--reference-repeats 1]
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import time
 from dataclasses import replace
 
 import torch
-from common import peak_memory_gb, store, studio_capture, timed
+from benchmarks.common import peak_memory_gb, store, studio_capture, timed
 
 from twofold.capture.pixels import PixelSource
 from twofold.methods.base import Avatar, Subject

@@ -1,0 +1,19 @@
+"""Every benchmark with one thread and with all, one after the other; results go to benchmarks/results/."""
+
+import subprocess
+import sys
+
+import torch
+
+
+def main() -> None:
+    """Runs them in processes of their own, so that each starts with fresh memory and threads."""
+    for threads in sorted({1, torch.get_num_threads()}):
+        for name in ("step", "rendering", "quality"):
+            command = [sys.executable, "-m", f"benchmarks.{name}", "--threads", str(threads)]
+            print("$", " ".join(command), flush=True)
+            subprocess.run(command, check=True)
+
+
+if __name__ == "__main__":
+    main()
