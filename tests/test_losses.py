@@ -147,3 +147,9 @@ def test_losses_pass_gradcheck():
     assert torch.autograd.gradcheck(lambda c: losses.s3im(c, truth, torch.Generator().manual_seed(0)), color)
     opacity = random(9).requires_grad_()
     assert torch.autograd.gradcheck(lambda o: losses.mask(o, random(9, seed=1)), opacity)
+
+
+def test_s3im_is_the_same_on_every_device(device, generator):
+    color, truth = random(41, 3), random(41, 3, seed=1)
+    found = losses.s3im(color.to(device), truth.to(device), generator)
+    assert found.item() == pytest.approx(losses.s3im(color, truth, torch.Generator().manual_seed(0)).item())

@@ -319,6 +319,14 @@ def test_gate_closes_away_from_the_base_surface(inputs):
     assert not share.requires_grad
 
 
+def test_field_is_the_same_on_every_device(config, inputs, device):
+    field = make(config)
+    expected = everything(field, inputs)
+    found = everything(field.to(device), [t.to(device) for t in inputs])
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a.cpu(), b)
+
+
 def test_no_points_give_no_answers(config, inputs):
     empty = [inputs[0][:0], inputs[1], inputs[2][:0]]
     assert make(config)(*empty).color.shape == (0, 3)

@@ -310,3 +310,13 @@ def test_random_sampling_needs_a_generator():
 def test_impossible_settings_are_refused(options, named):
     with pytest.raises(ValueError, match=named):
         replace(SMALL, **options)
+
+
+def test_samples_are_the_same_on_every_device(device, generator):
+    rays = some_rays()
+    there = Rays(*(t.to(device) for t in (rays.origins, rays.directions, rays.near, rays.far)))
+    beta = torch.tensor(0.02, dtype=torch.float64)
+    found = SMALL.sample(there, ball, beta.to(device), generator, training=True)
+    expected = SMALL.sample(rays, ball, beta, torch.Generator().manual_seed(0), training=True)
+    assert found.depth.device.type == device.type
+    torch.testing.assert_close(found.depth.cpu(), expected.depth)
