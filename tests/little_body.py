@@ -17,10 +17,11 @@ JOINTS = [
 ]  # fmt: skip
 
 
-def little_body(rings: int = 5, around: int = 8, thickness: float = 0.06) -> Body:
-    """Some 23 * (rings * around + 2) vertices, centimetres apart."""
+def little_body(spacing: float = 0.05, thickness: float = 0.06) -> Body:
+    """Vertices about `spacing` metres apart."""
     joints = torch.tensor(JOINTS)
     vertices, weights, faces = [], [], []
+    around = max(6, round(2 * math.pi * thickness / spacing))
     for child, parent in enumerate(PARENTS):
         if parent < 0:
             continue
@@ -29,6 +30,7 @@ def little_body(rings: int = 5, around: int = 8, thickness: float = 0.06) -> Bod
         across = torch.linalg.cross(along, torch.eye(3)[along.abs().argmin()])
         across = torch.nn.functional.normalize(across, dim=0)
         third = torch.linalg.cross(along, across)
+        rings = 1 + max(1, round(float((end - start).norm()) / spacing))
         first = sum(map(len, vertices))
         parts = [(start - thickness * along)[None]]
         shares = [torch.zeros(1)]
@@ -38,7 +40,7 @@ def little_body(rings: int = 5, around: int = 8, thickness: float = 0.06) -> Bod
             parts.append(start + t * (end - start) + thickness * ring)
             shares.append(t.expand(around))
         parts.append((end + thickness * along)[None])
-        vertices.append(torch.cat([*parts]))
+        vertices.append(torch.cat(parts))
         share = torch.cat([*shares, torch.ones(1)])
         weight = torch.zeros(len(share), 24)
         weight[:, parent], weight[:, child] = 1 - 0.5 * share, 0.5 * share
@@ -70,7 +72,7 @@ def _sausage(rings: int, around: int) -> torch.Tensor:
 
 
 def posed_little_body(
-    seed: int = 0, size: float = 0.3, dtype: torch.dtype = torch.float32, **options: int
+    seed: int = 0, size: float = 0.3, dtype: torch.dtype = torch.float32, **options: float
 ) -> PosedBody:
     """That body in a random pose, at a random place."""
     generator = torch.Generator().manual_seed(seed)

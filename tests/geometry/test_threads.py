@@ -1,14 +1,16 @@
 """A range cut into parts: nothing twice, nothing left out, in order."""
 
 import threading
+from functools import wraps
 from itertools import chain
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twofold.geometry.threads import in_parts
+from twofold.geometry.threads import compiled, in_parts
 
 
 @pytest.fixture(params=[1, 3])
@@ -39,3 +41,19 @@ def test_an_error_in_a_part_is_raised(threads):
 
     with pytest.raises(ValueError, match="the last part"):
         in_parts(10, work, least=1)
+
+
+def test_a_compiled_loop_is_the_plain_one_even_if_something_wraps_it():
+    def total(values):
+        out = 0.0
+        for i in range(len(values)):
+            out += values[i]
+        return out
+
+    @wraps(total)
+    def checked(values):
+        raise AssertionError("the check was compiled")
+
+    # Without the copy on disk, whose place the test's own file would have to give.
+    values = np.arange(5.0)
+    assert compiled(checked)(values) == total(values) == 10

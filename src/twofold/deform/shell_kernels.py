@@ -2,11 +2,12 @@
 
 # pyright: reportMissingParameterType=false
 
-import numba
 import numpy as np
 
+from twofold.geometry.threads import compiled
 
-@numba.njit(cache=True, nogil=True)
+
+@compiled
 def walk(origins, directions, near, far, start, step, low, voxel, row, nearest, vertices, limit, begin, end):  # noqa: ANN001, ANN201
     """Samples of rays begin..end within `limit` metres of their nearest listed vertex.
 
@@ -63,7 +64,7 @@ def walk(origins, directions, near, far, start, step, low, voxel, row, nearest, 
     return ray_of[:count], depth_of[:count], vertex_of[:count], square_of[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _grown(old, room):  # noqa: ANN001, ANN202
     new = np.empty(room, old.dtype)
     new[: old.shape[0]] = old

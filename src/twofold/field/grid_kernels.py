@@ -8,11 +8,12 @@ scatters, which own their rows) that a call handles.
 
 # pyright: reportMissingParameterType=false
 
-import numba
 import numpy as np
 
+from twofold.geometry.threads import compiled
 
-@numba.njit(inline="always", cache=True)
+
+@compiled
 def _cell(x, place, shape):  # noqa: ANN001, ANN202
     """Lower node of the cell and position in it; points outside are moved to the border."""
     u = min(max((x[0] - place[0]) * place[3], np.float32(0)), shape[0] - np.float32(1.001))
@@ -23,7 +24,7 @@ def _cell(x, place, shape):  # noqa: ANN001, ANN202
     return base, np.float32(u - i), np.float32(v - j), np.float32(w - k)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def interpolate(x, table, rows, place, shape, out, begin, end):  # noqa: ANN001, ANN201
     """out[S, L*C] = trilinear features."""
     channels = table.shape[1]
@@ -46,7 +47,7 @@ def interpolate(x, table, rows, place, shape, out, begin, end):  # noqa: ANN001,
                             out[s, at + c] += weight * table[row, c]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def scatter(x, gradient, rows, place, shape, by_table, begin, end):  # noqa: ANN001, ANN201
     """by_table[N, C] += transpose of `interpolate`; levels own their rows, so they run side by side."""
     channels = by_table.shape[1]
@@ -67,7 +68,7 @@ def scatter(x, gradient, rows, place, shape, by_table, begin, end):  # noqa: ANN
                             by_table[row, c] += weight * gradient[s, at + c]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def pull(x, table, cotangent, rows, place, shape, out, begin, end):  # noqa: ANN001, ANN201
     """out[S, 3] = J^T cotangent, J the derivative of `interpolate` by x."""
     channels = table.shape[1]
@@ -95,7 +96,7 @@ def pull(x, table, cotangent, rows, place, shape, out, begin, end):  # noqa: ANN
         out[s, 0], out[s, 1], out[s, 2] = gx, gy, gz
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def pull_scatter(x, cotangent, gradient, rows, place, shape, by_table, begin, end):  # noqa: ANN001, ANN201
     """by_table[N, C] += derivative of <gradient, pull(...)> by the table."""
     channels = by_table.shape[1]
@@ -119,7 +120,7 @@ def pull_scatter(x, cotangent, gradient, rows, place, shape, by_table, begin, en
                             by_table[row, c] += slope * cotangent[s, at + c]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def push(x, table, gradient, rows, place, shape, out, begin, end):  # noqa: ANN001, ANN201
     """out[S, L*C] = J gradient: the derivative of <gradient, pull(...)> by the cotangent."""
     channels = table.shape[1]

@@ -1,10 +1,21 @@
 """Compiled loops on several threads: the range is cut into as many parts as PyTorch uses threads."""
 
+import inspect
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from typing import Any
 
+import numba
 import torch
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compiles a loop over arrays; it lets go of the interpreter's lock, and the result is kept on disk.
+
+    A function that another one wraps, as checks of shapes do in the tests, is compiled as it was written.
+    """
+    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
 
 
 @lru_cache(maxsize=4)
