@@ -137,13 +137,15 @@ class GridField(nn.Module):
             self.low_grid = FeatureGrid(points, config.low_voxels, config.features, config.radius, generator)
             size = self.low_grid.size
             self.low_sdf = SmallNet(size, width, 1 + shared, low_code, generator)
-            self.low_color = SmallNet(size + shared + 3, width, 3 + shared, low_code, generator)
+            self.low_color = SmallNet(size + shared, width, 3 + shared, low_code, generator)
         if self.has_high:
             self.high_grid = FeatureGrid(points, config.high_voxels, config.features, config.radius, generator)
             size = self.high_grid.size
             self.high_sdf = SmallNet(size + handed, width, 1 + shared, high_code, generator)
-            self.high_color = SmallNet(size + shared + handed + 3, width, 3, high_code, generator)
+            self.high_color = SmallNet(size + shared + handed, width, 3, high_code, generator)
         self.handed = handed
+        self.light = nn.Linear(3, 3, bias=False)
+        nn.init.zeros_(self.light.weight)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by what they are: grid tables, and networks of either branch."""
@@ -224,22 +226,27 @@ class GridField(nn.Module):
         """
         # Normals enter the colours as constants: the shape learns from densities, at half the cost.
         g = self._geometry(x, pose, "constant")
-
-        def turned(gradient: Tensor) -> Tensor:
-            if to_observation is not None:
-                gradient = (to_observation.detach() * gradient[:, None]).sum(-1)
-            return F.normalize(gradient, dim=-1)
-
-        base, color, feature = None, torch.zeros_like(x), None
+        base, plain, feature = None, torch.zeros_like(x), None
         if self.has_low:
-            answer, _ = self.low_color(torch.cat([g.low, g.f1, turned(g.g1)], -1), g.code)
-            color, feature = torch.sigmoid(answer[:, :3]), answer[:, 3:]
-            base = FieldOutput(g.s1, color, g.g1)
+            answer, _ = self.low_color(torch.cat([g.low, g.f1], -1), g.code)
+            plain, feature = torch.sigmoid(answer[:, :3]), answer[:, 3:]
+            base = FieldOutput(g.s1, plain * self._light(g.g1, to_observation), g.g1)
         if self.has_high:
-            parts = [g.high, g.f2, turned(g.g)]
+            parts = [g.high, g.f2]
             if self.handed and feature is not None:
                 parts.append(F.relu(feature))
             residual, _ = self.high_color(torch.cat(parts, -1), g.code)
             alone = base is None or self.config.branches == "high_rendered"
-            color = torch.sigmoid(residual) if alone else color + g.gate[:, None] * residual
+            plain = torch.sigmoid(residual) if alone else plain + g.gate[:, None] * residual
+        color = plain * self._light(g.g, to_observation)
         return FieldOutput(g.s, color, g.g, base if self.config.branches in ("both", "high_rendered") else None)
+
+    def _light(self, gradient: Tensor, to_observation: Tensor | None) -> Tensor:
+        """Brightness for a normal, the same law for all points of the body.
+
+        A camera that stands still never sees normals that face away from it. A network with the normal among its inputs
+        invents colours for these; one smooth law, learned from every part of the body, carries on sensibly.
+        """
+        if to_observation is not None:
+            gradient = (to_observation.detach() * gradient[:, None]).sum(-1)
+        return torch.exp(self.light(F.normalize(gradient, dim=-1)))
