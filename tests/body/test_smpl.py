@@ -179,7 +179,7 @@ def test_fewer_than_ten_shapes_are_kept_as_they_are(tmp_path):
 def full_size(tmp_path_factory):
     """A file in the real format and size that smplx, too, can open, and smplx's model of it."""
     smplx = pytest.importorskip("smplx", reason="smplx is not installed")
-    arrays = model(v=6890, shapes=300, seed=3)
+    arrays = model(v=6890, seed=3)
     content = arrays | IGNORED | {"J_regressor": scipy.sparse.csc_matrix(arrays["J_regressor"])}
     path = write(tmp_path_factory.mktemp("smpl") / "SMPL_NEUTRAL.pkl", pickle.dumps(content, 2))
     return read_smpl(path), smplx.SMPL(str(path), num_betas=10)

