@@ -31,7 +31,7 @@ class GridFieldConfig:
 
     low_voxels: tuple[float, ...] = (0.12, 0.06)
     """Grid spacings of the pose-independent branch, metres."""
-    high_voxels: tuple[float, ...] = (0.025, 0.0125)
+    high_voxels: tuple[float, ...] = (0.02, 0.01)
     """Grid spacings of the pose-dependent branch, metres."""
     features: int = 4
     """Numbers per grid node."""
@@ -144,7 +144,7 @@ class GridField(nn.Module):
             self.high_sdf = SmallNet(size + handed, width, 1 + shared, high_code, generator)
             self.high_color = SmallNet(size + shared + handed, width, 3, high_code, generator)
         self.handed = handed
-        self.light = nn.Linear(3, 3, bias=False)
+        self.light = nn.Linear(9, 3, bias=False)
         nn.init.zeros_(self.light.weight)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -249,4 +249,6 @@ class GridField(nn.Module):
         """
         if to_observation is not None:
             gradient = (to_observation.detach() * gradient[:, None]).sum(-1)
-        return torch.exp(self.light(F.normalize(gradient, dim=-1)))
+        normal = F.normalize(gradient, dim=-1)
+        # Polynomials of degree two, as in spherical-harmonics lighting: what a diffuse surface shows of any surroundings.
+        return torch.exp(self.light(torch.cat([normal, normal * normal, normal * normal.roll(1, -1)], -1)))
