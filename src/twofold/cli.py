@@ -1,10 +1,16 @@
-"""The command line: `twofold studio`, `import`, `train`, `render`, `evaluate`, `demo`."""
+"""The command line: `twofold studio`, `import`, `train`, `render`, `evaluate`, `demo`.
 
+What a command needs is imported when it runs, so that `--help` answers at once.
+"""
+
+import functools
+import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -12,21 +18,30 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from twofold.errors import TwofoldError
 
+if TYPE_CHECKING:
+    from twofold.train.run import Recipe
+
 Parts = Literal["all", "orbit", "views", "poses", "canonical"]
 Recipes = Literal["quick", "fast", "released", "paper"]
-_console = Console(stderr=True, highlight=False)
+_alone = os.environ.get("RANK", "0") == "0"
+"""Of several processes that train together, the first one speaks for all."""
+
+
+def _console() -> Console:
+    """Where people read: standard error, as it is now."""
+    return Console(stderr=True, highlight=False, markup=False, quiet=not _alone)
 
 
 @contextmanager
-def _bar(title: str) -> Iterator[Callable[[float, str], None]]:
+def _bar(title: str) -> Generator[Callable[[float, str], None], None, None]:
     """A progress bar; the function it gives takes the share that is done and a word about it."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
     with Progress(
         *columns, TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
-        console=_console, refresh_per_second=4, speed_estimate_period=60,
+        console=_console(), refresh_per_second=4, speed_estimate_period=60,
     ) as progress:  # fmt: skip
         task = progress.add_task(title, total=1.0, note="")
-        yield lambda done, note="": progress.update(task, completed=done, note=note)
+        yield lambda done, note: progress.update(task, completed=done, note=note)
 
 
 def studio(
@@ -101,55 +116,65 @@ def train(
         device: auto, cpu, cuda or cuda:N.
         resume: Run folder of an interrupted training to continue.
     """
-    from dataclasses import replace
-
     from twofold.capture.folder import read_capture
     from twofold.capture.validate import require, validate
-    from twofold.config import with_overrides
-    from twofold.recipes import RECIPES
+    from twofold.outputs.gallery import save_preview
     from twofold.train import loop
-    from twofold.train.run import choose_device, read_about, read_recipe
+    from twofold.train.run import choose_device, find_capture, read_recipe
 
-    where = choose_device(device)
-    if resume is not None:
-        if set or out:
-            raise TwofoldError(
-                "--resume continues a run as it was begun; leave --set and --out out, or start a new run."
-            )
-        chosen, folder = read_recipe(resume), resume
-        capture = capture or Path(str(read_about(resume)["capture"]))
+    if resume is None:
+        chosen, folder, source = _new_run(capture, out, recipe, set, seed)
+    elif set or out or seed or recipe != "quick":
+        raise TwofoldError(
+            "--resume continues a run as it was begun; leave --set, --out, --seed and --recipe out, or start a new run."
+        )
     else:
-        if capture is None:
-            raise TwofoldError(
-                "Expected a capture folder (`twofold train CAPTURE`) or --resume RUN; neither was given."
-            )
-        chosen = with_overrides(replace(RECIPES[recipe](), seed=seed), list(set))
-        folder = out or Path("runs") / f"{capture.resolve().name}-{recipe}"
-        if (folder / "checkpoint.safetensors").exists():
-            raise TwofoldError(
-                f"{folder} already holds a run; continue it with --resume {folder}, or choose another --out."
-            )
-    require(validate(capture), capture)
-    read = read_capture(capture)
-    with _bar("Training") as show:
-        loop.train(
-            read, chosen, folder, where, resume is not None,
-            lambda p: show(p.step / p.steps, f"step {p.step}  loss {sum(p.losses.values()):.4f}  {p.psnr:.1f} dB"),
-            _attach_lpips,
-        )  # fmt: skip
+        chosen, folder = read_recipe(resume), resume
+        source = find_capture(resume, capture, "twofold train CAPTURE --resume RUN")
+    where = choose_device(device)
+    require(validate(source), source)
+    read = read_capture(source)
+    try:
+        with _bar("Training") as show:
+            loop.train(
+                read, chosen, folder, where, resume is not None,
+                lambda p: show(p.step / p.steps, f"step {p.step}  loss {sum(p.losses.values()):.4f}  {p.psnr:.1f} dB"),
+                _attach_lpips,
+                lambda avatar, step: save_preview(avatar, read, folder, step),
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"The training continues with: twofold train --resume {folder}") from None
     _say(f"The avatar is in {folder}.", f"twofold render {folder}")
 
 
-def _attach_lpips(avatar: object) -> None:
-    """Gives the avatar its perceptual loss, or says once that it goes without."""
-    from twofold.methods.factorized import FactorizedAvatar
-    from twofold.metrics.perceptual import load_lpips
+def _new_run(
+    capture: Path | None, out: Path | None, recipe: Recipes, overrides: tuple[str, ...], seed: int
+) -> "tuple[Recipe, Path, Path]":
+    """Recipe, folder and capture of a run to begin."""
+    from twofold.config import with_overrides
+    from twofold.recipes import RECIPES
+    from twofold.train.run import require_free
 
-    if isinstance(avatar, FactorizedAvatar) and avatar.config.losses.lpips:
-        network, message = load_lpips()
-        avatar.lpips = network.to(avatar.device) if network else None
-        if message:
-            _console.print(message)
+    if capture is None:
+        raise TwofoldError("Expected a capture folder (`twofold train CAPTURE`) or --resume RUN; neither was given.")
+    folder = out or Path("runs") / f"{capture.resolve().name}-{recipe}"
+    require_free(folder)
+    return with_overrides(replace(RECIPES[recipe](), seed=seed), overrides), folder, capture
+
+
+def _attach_lpips(avatar: object) -> str | None:
+    """Gives the avatar its perceptual loss where its recipe has one, or says once that it goes without."""
+    from twofold.methods.factorized import FactorizedAvatar
+    from twofold.metrics.perceptual import load_lpips, weights_hint
+
+    if not isinstance(avatar, FactorizedAvatar) or not avatar.config.losses.lpips:
+        return None
+    network = load_lpips()
+    avatar.attach_lpips(network)
+    if network is not None:
+        return "LPIPS is part of the loss."
+    _console().print(weights_hint(), soft_wrap=True)
+    return weights_hint()
 
 
 def render(
@@ -174,13 +199,14 @@ def render(
     """
     from twofold.capture.folder import read_capture
     from twofold.outputs.gallery import render_run
-    from twofold.train.run import choose_device, load, read_about
+    from twofold.train.run import choose_device, find_capture, load
 
+    _at_least(size=(size, 8), chunk=(chunk, 1))
     avatar, _ = load(run, choose_device(device))
-    source = capture or Path(str(read_about(run)["capture"]))
+    read = read_capture(find_capture(run, capture))
     folder = out or run / "renders"
     with _bar("Drawing") as show:
-        render_run(avatar, read_capture(source), folder, what, size, chunk, lambda done: show(done, ""))
+        render_run(avatar, read, folder, what, size, chunk, lambda done: show(done, ""))
     _say(f"The pictures are in {folder}.", f"twofold evaluate {run}")
 
 
@@ -202,10 +228,11 @@ def evaluate(
     """
     from twofold.capture.folder import read_capture
     from twofold.evaluate import evaluate as measure
-    from twofold.train.run import choose_device, load, read_about
+    from twofold.train.run import choose_device, find_capture, load
 
+    _at_least(most=(most, 1), meshes=(meshes, 0))
     avatar, _ = load(run, choose_device(device))
-    read = read_capture(capture or Path(str(read_about(run)["capture"])))
+    read = read_capture(find_capture(run, capture))
     count = sum(min(len(read.splits.get(s, ())), most or 10**9) for s in ("novel_view", "novel_pose"))
     done = 0
 
@@ -219,7 +246,8 @@ def evaluate(
     for section, values in metrics.items():
         if isinstance(values, dict):
             numbers = {k: v for k, v in values.items() if isinstance(v, float)}
-            _console.print(f"{section}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items()))
+            line = f"{section}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items())
+            _console().print(line, soft_wrap=True)
     _say(f"The figures are in {run / 'metrics.json'}.", f"twofold render {run}")
 
 
@@ -238,7 +266,14 @@ def demo(out: Path = Path("demo"), seed: int = 0) -> None:
 
 
 def _say(result: str, following: str) -> None:
-    _console.print(f"{result} Next: {following}", soft_wrap=True)
+    _console().print(f"{result} Next: {following}", soft_wrap=True)
+
+
+def _at_least(**options: tuple[int | None, int]) -> None:
+    """Refuses options (value, least) that are too small."""
+    for name, (value, least) in options.items():
+        if value is not None and value < least:
+            raise TwofoldError(f"--{name} should be at least {least}; it is {value}.")
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -251,22 +286,32 @@ COMMANDS: dict[str, Callable[..., None]] = {
 }
 
 
+def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """The command with the same arguments, to be run when they have all been read."""
+
+    @functools.wraps(command)
+    def chosen(*args: object, **options: object) -> Callable[[], None]:
+        return functools.partial(command, *args, **options)
+
+    return chosen
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `twofold` command: exit code 0, 2 for input that cannot be used, 130 after Ctrl-C."""
-    from twofold.speed import tune_process
-
-    tune_process()
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS, prog="twofold", args=arguments, description="A video of a person goes in, an avatar comes out.",
-            config=(tyro.conf.AvoidSubcommands,),
+        command = tyro.extras.subcommand_cli_from_dict(
+            {name: _later(command) for name, command in COMMANDS.items()}, prog="twofold", args=arguments,
+            description="A video of a person goes in, an avatar comes out.", config=(tyro.conf.AvoidSubcommands,),
         )  # fmt: skip
+        from twofold.speed import tune_process
+
+        tune_process()
+        command()
     except TwofoldError as error:
-        print(f"twofold: {error}", file=sys.stderr)
+        if _alone:
+            print(f"twofold: {error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
-        print(
-            "twofold: stopped. A training that was stopped continues with `twofold train --resume RUN`.",
-            file=sys.stderr,
-        )
+    except KeyboardInterrupt as stop:
+        if _alone:
+            print(" ".join(["twofold: stopped.", *map(str, stop.args)]), file=sys.stderr)
         sys.exit(130)

@@ -4,8 +4,6 @@ import ctypes
 import os
 import sys
 
-import torch
-
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 
 
@@ -16,6 +14,8 @@ def tune_process() -> None:
     Memory: glibc returns large blocks to the system and fetches them again zeroed, page by page, at every step.
     Call it before the first parallel operation; elsewhere than on Linux only the first half applies.
     """
+    import torch
+
     torch.set_flush_denormal(True)
     if sys.platform != "linux" or "MALLOC_" in "".join(os.environ) or "GLIBC_TUNABLES" in os.environ:
         return

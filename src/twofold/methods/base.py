@@ -63,22 +63,27 @@ class Subject:
         """What `arrays` gave, read back.
 
         Raises:
-            TwofoldError: something is missing or has the wrong shape.
+            TwofoldError: something is missing, has the wrong shape or is not finite.
         """
-        names = ("betas", "times", "poses", "translations", "scene_scale")
-        missing = [name for name in names if name not in arrays]
+        shapes = {"betas": ("S",), "times": ("T",), "poses": ("T", 24, 3), "translations": ("T", 3), "scene_scale": ()}
+        missing = [name for name in shapes if name not in arrays]
         if missing:
             raise TwofoldError(f"{where} lacks {', '.join(missing)}; it is damaged, train again.")
         body = Body.from_arrays({n[5:]: a for n, a in arrays.items() if n.startswith("body_")}, where)
-        times, poses, translations = arrays["times"], arrays["poses"], arrays["translations"]
-        if poses.shape != (len(times), 24, 3) or translations.shape != (len(times), 3):
-            raise TwofoldError(f"{where} holds {len(times)} moments but poses {poses.shape}; it is damaged, train again.")
+        sizes: dict[str | int, int] = {"S": arrays["betas"].size, "T": arrays["times"].size}
+        for name, shape in shapes.items():
+            array, expected = arrays[name], tuple(sizes.get(axis, axis) for axis in shape)
+            if array.shape != expected or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+                raise TwofoldError(
+                    f"{name} in {where} should be finite numbers of shape {expected}, it is {array.dtype} of "
+                    f"{array.shape}; it is damaged, train again."
+                )
         return Subject(
             body=body,
             betas=torch.as_tensor(arrays["betas"]).float(),
-            times=torch.as_tensor(times).long(),
-            poses=torch.as_tensor(poses).float(),
-            translations=torch.as_tensor(translations).float(),
+            times=torch.as_tensor(arrays["times"]).long(),
+            poses=torch.as_tensor(arrays["poses"]).float(),
+            translations=torch.as_tensor(arrays["translations"]).float(),
             scene_scale=float(arrays["scene_scale"]),
         )
 
@@ -119,7 +124,11 @@ class Avatar(nn.Module, ABC):
 
     @abstractmethod
     def pose(
-        self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], time: int | None = None, step: int | None = None
+        self,
+        pose: Float[Tensor, "24 3"],
+        translation: Float[Tensor, "3"],
+        time: int | None = None,
+        step: int | None = None,
     ) -> PosedAvatar:
         """The avatar in a pose.
 
@@ -143,9 +152,7 @@ class Avatar(nn.Module, ABC):
         """Named loss terms, already weighted; the loop adds them."""
 
     @abstractmethod
-    def level(
-        self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full"
-    ) -> Float[Tensor, "S"]:
+    def level(self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full") -> Float[Tensor, "S"]:
         """Zero on the surface in canonical space, negative inside; of the "full" field or its "base" branch."""
 
     @abstractmethod

@@ -1,14 +1,14 @@
 """The paper's method: an avatar whose field has a pose-independent and a pose-dependent branch."""
 
-import math
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -39,7 +39,11 @@ class ShellSampler:
     voxel: float = 0.02
     """Edge of the voxels that list where the shell is, metres."""
     least_weight: float = 1e-3
-    """Samples that would add less than this to their pixel are found by a pass without gradients and left out; 0 keeps all."""
+    """Samples that a pass without gradients finds to add less than this to their pixel are left out; 0 keeps all."""
+
+    def __post_init__(self) -> None:
+        """Refuses sizes that leave nothing to sample."""
+        _require(min(self.radius, self.step, self.voxel) > 0, "radius, step and voxel should be positive")
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,12 @@ class LossConfig:
     """Standard deviation of that, metres."""
     reduction: Literal["mean", "sum"] = "mean"
     """Whether colour differences are averaged over rays and channels, as released, or summed, as printed."""
+
+    def __post_init__(self) -> None:
+        """Refuses weights that reward what they should punish."""
+        weights = (self.eikonal, self.common, self.lpips, self.mask, self.s3im)
+        right = min(weights) >= 0 < self.reconstruction and self.eikonal_points > 0
+        _require(right, "weights should not be negative, reconstruction and eikonal_points positive")
 
 
 @dataclass(frozen=True)
@@ -107,6 +117,14 @@ class FactorizedConfig:
     shell_refresh: int = 500
     """Steps after which the shells follow the corrected poses."""
 
+    def __post_init__(self) -> None:
+        """Refuses options that exclude each other."""
+        _require(self.neighbours > 0 < self.shell_refresh, "neighbours and shell_refresh should be at least 1")
+        _require(0 < self.beta_floor < self.beta, f"beta_floor should lie between 0 and beta={self.beta}")
+        if isinstance(self.field, GridFieldConfig) and isinstance(self.sampler, ShellSampler):
+            within = self.sampler.radius <= self.field.radius
+            _require(within, f"sampler.radius should be at most field.radius={self.field.radius}, where features end")
+
     def build(self, subject: Subject, seed: int = 0) -> "FactorizedAvatar":
         """An untrained avatar of a subject."""
         return FactorizedAvatar(self, subject, seed)
@@ -114,6 +132,11 @@ class FactorizedConfig:
 
 class FactorizedAvatar(Avatar):
     """See `FactorizedConfig`."""
+
+    shell_poses: Tensor
+    shell_translations: Tensor
+    shell_shape: Tensor
+    canonical_points: Tensor
 
     def __init__(self, config: FactorizedConfig, subject: Subject, seed: int) -> None:
         """Builds the field around the subject's canonical body."""
@@ -129,17 +152,21 @@ class FactorizedAvatar(Avatar):
             self.field = config.field.build(pose_size, generator)
         start = config.beta - config.beta_floor
         # Softplus with this sharpness is nearly linear at the start, yet never reaches zero.
-        raw = start if config.beta_form == "absolute" else _inverse_softplus(start / _BETA_UNIT) * _BETA_UNIT
+        raw = start if config.beta_form == "absolute" else math.log(math.expm1(start / _BETA_UNIT)) * _BETA_UNIT
         self.raw_beta = nn.Parameter(torch.tensor(float(raw)))
         self.scale = subject.scene_scale if config.scene_scale == "released" else 1.0
-        # Shells are made of the poses as they were at the last refresh; kept so that a resumed run repeats them.
+        # Shells are made of poses and shape as they were at the last refresh; kept so that a resumed run repeats them.
         self.register_buffer("shell_poses", subject.poses.clone())
         self.register_buffer("shell_translations", subject.translations.clone())
+        self.register_buffer("shell_shape", torch.zeros_like(subject.betas))
         self.register_buffer("canonical_points", canonical.canonical_vertices.clone(), persistent=False)
-        self.register_buffer("basis", torch.zeros(0), persistent=False)
         self._shells: dict[int, Shell] = {}
-        self._shaped: ShapedBody | None = None
-        self.lpips: LPIPS | None = None
+        self._bodies = {torch.device("cpu"): subject.body}
+        self._perceptual: tuple[LPIPS, ...] = ()
+
+    def attach_lpips(self, network: LPIPS | None) -> None:
+        """Gives it the network behind the perceptual term, which is neither trained, nor stored, nor moved with it."""
+        self._perceptual = (network.to(self.device),) if network else ()
 
     @property
     def device(self) -> torch.device:
@@ -168,10 +195,15 @@ class FactorizedAvatar(Avatar):
                 pose, translation = self.subject.poses[row], self.subject.translations[row]
                 pose, translation = self.refinement(int(time), pose.to(self.device), translation.to(self.device))
                 self.shell_poses[row], self.shell_translations[row] = pose, translation
+            self.shell_shape.copy_(self.refinement.shape)
         self._shells.clear()
 
     def pose(
-        self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], time: int | None = None, step: int | None = None
+        self,
+        pose: Float[Tensor, "24 3"],
+        translation: Float[Tensor, "3"],
+        time: int | None = None,
+        step: int | None = None,
     ) -> PosedAvatar:
         """See `Avatar.pose`. While training, a moment's shell is reused until the next refresh."""
         pose, translation = pose.to(self.device), translation.to(self.device)
@@ -181,17 +213,16 @@ class FactorizedAvatar(Avatar):
             with torch.set_grad_enabled(torch.is_grad_enabled() and refining):
                 pose, translation = self.refinement(time, pose, translation)
         with torch.set_grad_enabled(torch.is_grad_enabled() and refining and bool(self.refinement.parts)):
-            body = pose_body(self._shape(), pose, translation)
+            body = pose_body(self._shape(self.refinement.shape), pose, translation)
             forward = vertex_transforms(body)
         return PosedAvatar(body, forward, self._condition(pose, step), self._shell(body, time, training))
 
-    def _shape(self) -> ShapedBody:
-        betas = self.subject.betas.to(self.device) + self.refinement.shape
+    def _shape(self, change: Tensor) -> ShapedBody:
         body = self.subject.body
-        if self.device.type != "cpu":
+        if self.device not in self._bodies:
             tensors = {n: t.to(self.device) for n, t in vars(body).items() if isinstance(t, Tensor)}
-            body = type(body)(name=body.name, **tensors)
-        return shape_body(body, betas)
+            self._bodies[self.device] = type(body)(name=body.name, **tensors)
+        return shape_body(self._bodies[self.device], self.subject.betas.to(self.device) + change)
 
     def _condition(self, pose: Tensor, step: int | None) -> Tensor:
         config = self.config.pose
@@ -199,8 +230,7 @@ class FactorizedAvatar(Avatar):
         if config.divide_by_pi:
             told = told / math.pi
         if step is not None:
-            epoch = step // max(len(self.subject.times), 1)
-            dropped = _hash01(step) < config.drop
+            epoch, dropped = step // len(self.subject.times), _hash01(step) < config.drop
             if step < config.zero_until or dropped or (config.zero_every and epoch % config.zero_every == 0):
                 told = torch.zeros_like(told)
         return told
@@ -208,16 +238,16 @@ class FactorizedAvatar(Avatar):
     def _shell(self, body: PosedBody, time: int | None, training: bool) -> Shell:
         sampler = self.config.sampler
         radius, voxel = (sampler.radius, sampler.voxel) if isinstance(sampler, ShellSampler) else (0.1, 0.03)
+        listed = max(6, 2 * self.config.neighbours)
         row = self.refinement.rows.get(time) if training and time is not None else None
         if row is None:
-            return build_shell(body.vertices, body.faces, radius, voxel)
+            return build_shell(body.vertices, body.faces, radius, voxel, listed)
         if row not in self._shells:
             with torch.no_grad():
-                start = pose_body(self._shape(), self.shell_poses[row], self.shell_translations[row])
-            self._shells[row] = build_shell(start.vertices, body.faces, radius, voxel)
+                shaped = self._shape(self.shell_shape)
+                start = pose_body(shaped, self.shell_poses[row], self.shell_translations[row])
+            self._shells[row] = build_shell(start.vertices, body.faces, radius, voxel, listed)
         return self._shells[row]
-
-    # -- rendering -----------------------------------------------------------------------------------------------------
 
     def render(
         self, rays: Rays, posed: PosedAvatar, background: Float[Tensor, "3"], generator: torch.Generator | None = None
@@ -225,7 +255,7 @@ class FactorizedAvatar(Avatar):
         """See `Avatar.render`."""
         samples, nearest, shares, outlier = self._place(rays, posed, generator)
         if len(samples) == 0:
-            return _nothing(len(rays), background)
+            return self._nothing(len(rays), background)
         x_canonical, to_observation = to_canonical(samples.points(rays), nearest, shares, posed.forward)
         answer = self.field(x_canonical, posed.condition, to_observation)
         normals = F.normalize((to_observation * answer.gradient[:, None]).sum(-1), dim=-1)
@@ -249,6 +279,13 @@ class FactorizedAvatar(Avatar):
         opacity = out[:, 3]
         depth = out[:, 4] / opacity.detach().clamp_min(1e-6)
         return Rendering(out[:, :3] + (1 - opacity[:, None]) * background, opacity, depth, out[:, 5:8])
+
+    def _nothing(self, rays: int, background: Tensor) -> Rendering:
+        # Tied to a parameter, so that a step whose rays all miss has a gradient, of zero, like any other.
+        zero = (0 * self.beta).expand(rays)
+        empty = Rendering(background + zero[:, None], zero, zero, zero[:, None].expand(rays, 3))
+        two = self.config.field.branches in ("both", "high_rendered")
+        return dataclasses.replace(empty, base=empty if two else None)
 
     def _place(
         self, rays: Rays, posed: PosedAvatar, generator: torch.Generator | None
@@ -279,7 +316,7 @@ class FactorizedAvatar(Avatar):
         low, high = posed.body.joints.detach().amin(0) - margin, posed.body.joints.detach().amax(0) + margin
         clipped, hit = clip_to_box(rays, low, high)
         inside = hit.nonzero()[:, 0]
-        tree = cKDTree(posed.body.vertices.detach().cpu().numpy())
+        tree = KDTree(posed.body.vertices.detach().cpu().numpy())
         limit = self.config.outlier_distance / self.scale
 
         def neighbours(points: Tensor) -> tuple[Tensor, Tensor]:
@@ -302,8 +339,6 @@ class FactorizedAvatar(Avatar):
         outlier = (apart[:, 0] > limit) & self.config.outliers_in_shading & (generator is None)
         return samples, index, neighbour_weights(apart**2), outlier
 
-    # -- losses --------------------------------------------------------------------------------------------------------
-
     def losses(
         self, rendering: Rendering, batch: Batch, posed: PosedAvatar, step: int, generator: torch.Generator
     ) -> dict[str, Float[Tensor, ""]]:
@@ -320,43 +355,40 @@ class FactorizedAvatar(Avatar):
         if config.s3im and batch.singles:
             singles = slice(0, batch.singles)
             terms["s3im"] = losses.s3im(rendering.color[singles], batch.color[singles], generator)
-        if config.lpips and self.lpips is not None and step >= config.lpips_start and len(batch.patch_pixels):
-            terms["lpips"] = self.lpips(_patches(rendering.color, batch), _patches(batch.color, batch)).mean()
+        if config.lpips and self._perceptual and step >= config.lpips_start and len(batch.patch_pixels):
+            terms["lpips"] = self._perceptual[0](_patches(rendering.color, batch), _patches(batch.color, batch)).mean()
         return {name: getattr(config, name) * term for name, term in terms.items()}
 
     def _eikonal_gradients(self, posed: PosedAvatar, generator: torch.Generator) -> Tensor:
         config, points = self.config.losses, self.canonical_points
-        which = torch.randint(len(points), (config.eikonal_points,), generator=generator, device=generator.device)
-        moved = torch.randn(config.eikonal_points, 3, generator=generator, device=generator.device)
+        count, device = config.eikonal_points, generator.device
+        which = torch.randint(len(points), (count,), generator=generator, device=device)
+        moved = torch.randn(count, 3, generator=generator, device=device)
         x = points[which.to(self.device)] + config.eikonal_spread * moved.to(self.device)
         return self.field.distance_and_gradient(x, posed.condition)[1]
 
-    def level(
-        self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full"
-    ) -> Float[Tensor, "S"]:
+    def level(self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full") -> Float[Tensor, "S"]:
         """See `Avatar.level`."""
+        if branch not in ("full", "base"):
+            raise ValueError(f'branch is "full" or "base"; it is {branch!r}')
         if branch == "base":
             answer = self.field(x_canonical, posed.condition, None)
             return (answer.base or answer).sdf
         return self.field.sdf(x_canonical, posed.condition)
 
 
+def _require(holds: bool, wanted: str) -> None:
+    if not holds:
+        raise ValueError(wanted)
+
+
 _BETA_UNIT = 0.01
 """Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""
-
-
-def _inverse_softplus(value: float) -> float:
-    return value if value > 30 else math.log(math.expm1(value))
 
 
 def _hash01(step: int) -> float:
     """A fixed number in 0..1 for each step, so that a resumed run makes the same choices."""
     return ((step * 2654435761 + 12345) % 4294967296) / 4294967296
-
-
-def _nothing(rays: int, background: Tensor) -> Rendering:
-    zero = torch.zeros(rays, device=background.device)
-    return Rendering(background.expand(rays, 3), zero, zero, zero[:, None].expand(rays, 3))
 
 
 def _patches(color: Tensor, batch: Batch) -> Tensor:

@@ -10,49 +10,69 @@ from PIL import Image
 from torch import Tensor
 
 from twofold.capture.types import Capture, Frame
-from twofold.files import write_atomically
+from twofold.errors import TwofoldError
+from twofold.files import plain_errors, write_atomically
 from twofold.methods.base import Avatar, PosedAvatar
-from twofold.metrics.image import to_8bit
-from twofold.outputs.sheets import color_normals, residual_picture, sheet
+from twofold.metrics.image import subject_box
+from twofold.outputs.sheets import as_bytes, color_normals, residual_picture, sheet
 from twofold.outputs.video import write_video
 from twofold.outputs.views import Picture, draw, orbit, pose_canonically
 
 
 def save_png(path: Path, image: UInt8[np.ndarray, "h w *c"]) -> None:
     """Writes a PNG, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    with plain_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     with write_atomically(path) as beside:
         Image.fromarray(image).save(beside, format="PNG")
 
 
+def save_preview(avatar: Avatar, capture: Capture, folder: Path, step: int) -> None:
+    """Writes previews/STEP.png: a training picture, the avatar's and its normals, at most 256 pixels high."""
+    frame = capture.train[(step // 7) % len(capture.train)]
+    height = min(256, frame.camera.height)
+    camera = frame.camera.resized(height, round(frame.camera.width * height / frame.camera.height))
+    picture = draw(avatar, avatar.pose(frame.pose, frame.translation, frame.time), camera, _background(capture))
+    true = Image.fromarray(as_bytes(frame.image())).resize((camera.width, height), Image.Resampling.BOX)
+    parts = [np.asarray(true), *(panels(picture)[name] for name in ("full", "normals"))]
+    save_png(folder / "previews" / f"{step:06d}.png", np.concatenate(parts, 1))
+
+
+def _background(capture: Capture) -> Tensor:
+    return torch.tensor(capture.background)
+
+
 def panels(picture: Picture) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
     """What a rendering is made of, as pictures: full, base, residual, normals of both, opacity."""
-    opacity = picture.opacity[..., None].expand(-1, -1, 3)
-    return {
-        "full": to_8bit(picture.color).numpy(),
-        "base": to_8bit(picture.base).numpy(),
+    parts = {
+        "full": picture.color,
+        "base": picture.base,
         "residual": residual_picture(picture.color, picture.base),
         "normals": color_normals(picture.normal, picture.opacity),
         "base normals": color_normals(picture.base_normal, picture.opacity),
-        "opacity": to_8bit(opacity).numpy(),
+        "opacity": picture.opacity,
     }
+    return {name: as_bytes(part) for name, part in parts.items()}
 
 
 def beside_truth(
     avatar: Avatar, capture: Capture, frame: Frame, chunk: int | None = None
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Picture]:
     """A frame's own picture on the background, and the avatar's."""
-    background = torch.tensor(capture.background)
+    background = _background(capture)
     mask = frame.mask()[..., None]
     posed = avatar.pose(frame.pose, frame.translation)
-    return to_8bit(frame.image() * mask + background * (1 - mask)).numpy(), draw(
-        avatar, posed, frame.camera, background, chunk
-    )
+    picture = draw(avatar, posed, frame.camera, background, chunk)
+    return as_bytes(frame.image() * mask + background * (1 - mask)), picture
 
 
-def comparison(avatar: Avatar, capture: Capture, frames: list[Frame], chunk: int | None = None) -> np.ndarray:
+def comparison(
+    avatar: Avatar, capture: Capture, frames: list[Frame], chunk: int | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
     """A sheet with a row for each frame: the truth beside all panels, cut to the person."""
-    rows, labels, columns = [], [], []
+    rows: list[list[UInt8[np.ndarray, "h w 3"]]] = []
+    labels: list[str] = []
+    columns: list[str] = []
     for frame in frames:
         true, picture = beside_truth(avatar, capture, frame, chunk)
         parts = {"truth": true, **panels(picture)}
@@ -64,16 +84,12 @@ def comparison(avatar: Avatar, capture: Capture, frames: list[Frame], chunk: int
 
 
 def _around(mask: Float[Tensor, "h w"]) -> tuple[slice, slice]:
-    rows, columns = (mask > 0.5).any(1).nonzero()[:, 0], (mask > 0.5).any(0).nonzero()[:, 0]
-    margin = 6
-    return (
-        slice(max(int(rows.min()) - margin, 0), int(rows.max()) + margin),
-        slice(max(int(columns.min()) - margin, 0), int(columns.max()) + margin),
-    )
+    """The person's box and a little room; the whole picture where nobody is."""
+    return subject_box(mask, margin=6) if (mask > 0.5).any() else (slice(None), slice(None))
 
 
 def spread(frames: tuple[Frame, ...], count: int) -> list[Frame]:
-    """So many of the frames, evenly spread, each of another camera where there are several."""
+    """So many of the frames, evenly spread from the first to the last."""
     if not frames:
         return []
     chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
@@ -81,11 +97,12 @@ def spread(frames: tuple[Frame, ...], count: int) -> list[Frame]:
 
 
 def orbit_frames(
-    avatar: Avatar, posed: PosedAvatar, capture: Capture, size: int, views: int, up: Float[Tensor, "3"] | None = None
-) -> Iterator[Picture]:
+    avatar: Avatar, posed: PosedAvatar, capture: Capture, size: int, views: int, up: Float[Tensor, "3"] | None = None,
+    chunk: int | None = None,
+) -> Iterator[Picture]:  # fmt: skip
     """Pictures from all around."""
     for camera in orbit(posed, size, views, up):
-        yield draw(avatar, posed, camera, torch.tensor(capture.background))
+        yield draw(avatar, posed, camera, _background(capture), chunk)
 
 
 def scene_up(capture: Capture) -> Float[Tensor, "3"]:
@@ -94,7 +111,9 @@ def scene_up(capture: Capture) -> Float[Tensor, "3"]:
     return torch.nn.functional.normalize(ups.mean(0), dim=0)
 
 
-def motion_frames(avatar: Avatar, capture: Capture, split: str, size: int) -> Iterator[np.ndarray]:
+def motion_frames(
+    avatar: Avatar, capture: Capture, split: str, size: int, chunk: int | None = None
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """A split's poses one after the other from one fixed camera, full beside base."""
     moments = {frame.time: frame for frame in reversed(capture.splits[split])}
     camera = None
@@ -102,8 +121,9 @@ def motion_frames(avatar: Avatar, capture: Capture, split: str, size: int) -> It
         frame = moments[time]
         height = min(size, frame.camera.height)
         camera = camera or frame.camera.resized(height, round(frame.camera.width * height / frame.camera.height))
-        picture = draw(avatar, avatar.pose(frame.pose, frame.translation), camera, torch.tensor(capture.background))
-        yield np.concatenate([to_8bit(picture.color).numpy(), to_8bit(picture.base).numpy()], 1)
+        posed = avatar.pose(frame.pose, frame.translation)
+        picture = draw(avatar, posed, camera, _background(capture), chunk)
+        yield np.concatenate([as_bytes(picture.color), as_bytes(picture.base)], 1)
 
 
 def render_run(
@@ -121,31 +141,40 @@ def render_run(
         chunk: rays at once; None as many as memory allows.
         show: told the share that is done.
         views: pictures of the orbit.
+
+    Raises:
+        TwofoldError: the capture has no frames for the one part that was asked for, or the folder cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    background = torch.tensor(capture.background)
+    splits = {"views": "novel_view", "poses": "novel_pose"}
+    if what in splits and not capture.splits.get(splits[what]):
+        raise TwofoldError(
+            f"{capture.folder} has no pictures in its split {splits[what]}, so there is nothing to compare with; "
+            "draw the orbit or the canonical pose instead."
+        )
+    background = _background(capture)
     if what in ("all", "canonical"):
         posed = pose_canonically(avatar)
         parts = [panels(draw(avatar, posed, camera, background, chunk)) for camera in orbit(posed, size, 2)]
         save_png(folder / "canonical.png", sheet([list(p.values()) for p in parts], ["front", "back"], list(parts[0])))
     show(0.1)
-    for part, split, name in (("views", "novel_view", "novel_view"), ("poses", "novel_pose", "novel_pose")):
+    for part, split in splits.items():
         if what in ("all", part) and capture.splits.get(split):
             frames = spread(capture.splits[split], 5)
-            save_png(folder / f"{name}.png", comparison(avatar, capture, frames, chunk))
+            save_png(folder / f"{split}.png", comparison(avatar, capture, frames, chunk))
             if split == "novel_pose":
-                write_video(folder / "novel_pose.mp4", motion_frames(avatar, capture, split, size), 12)
+                write_video(folder / "novel_pose.mp4", motion_frames(avatar, capture, split, size, chunk), 12)
         show(0.3)
     if what in ("all", "orbit"):
         frame = capture.train[0]
         posed = avatar.pose(frame.pose, frame.translation, frame.time)
 
         def turning() -> Iterator[np.ndarray]:
-            for view, picture in enumerate(orbit_frames(avatar, posed, capture, size, views, scene_up(capture))):
-                color = to_8bit(picture.color).numpy()
-                save_png(folder / "orbit" / f"{view:03d}.png", color)
+            pictures = orbit_frames(avatar, posed, capture, size, views, scene_up(capture), chunk)
+            for view, picture in enumerate(pictures):
+                parts = panels(picture)
+                save_png(folder / "orbit" / f"{view:03d}.png", parts["full"])
                 show(0.3 + 0.7 * (view + 1) / views)
-                yield np.concatenate([color, color_normals(picture.normal, picture.opacity)], 1)
+                yield np.concatenate([parts["full"], parts["normals"]], 1)
 
         write_video(folder / "orbit.mp4", turning(), 12)
     show(1.0)

@@ -3,38 +3,43 @@
 import contextlib
 import csv
 import io
-import os
+import math
 import signal
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
+from twofold import losses
 from twofold.capture.pixels import PixelSource
 from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
-from twofold.files import write_atomically
+from twofold.files import plain_errors, write_atomically
 from twofold.methods.base import Avatar, Subject
-from twofold.outputs.views import draw
+from twofold.train.processes import Team, joined
 from twofold.train.run import (
+    CHECKPOINT,
+    CURVES,
     Recipe,
     TrainingConfig,
     load_optimizer,
     load_state,
     read_checkpoint,
     read_subject,
+    require_free,
     start_folder,
     write_checkpoint,
 )
+
+ROW_EVERY = 20
+"""Steps between two rows of the curves."""
 
 
 @dataclass(frozen=True)
@@ -50,19 +55,21 @@ class Progress:
 class Step(nn.Module):
     """One training step's losses as a module's `forward`, which is where DDP synchronises gradients."""
 
+    background: Tensor
+
     def __init__(self, avatar: Avatar, source: PixelSource, background: Float[Tensor, "3"], recipe: Recipe) -> None:
         """Everything a step needs beside its number."""
         super().__init__()
         self.avatar, self.source, self.recipe = avatar, source, recipe
         self.register_buffer("background", background, persistent=False)
 
-    def forward(self, step: int, rank: int = 0, world: int = 1) -> tuple[dict[str, Tensor], Tensor]:
+    def forward(self, step: int, team: Team) -> tuple[dict[str, Tensor], Tensor]:
         """Mean loss terms of this process's share of the step's pictures, and the mean squared error of its colours."""
-        images = self.recipe.training.images_per_step // world
+        images = self.recipe.training.images_per_step // team.size
         order = frame_order(self.recipe, len(self.source.frames), step)
         terms: dict[str, Tensor] = {}
         error = torch.zeros((), device=self.background.device)
-        for slot in range(rank * images, (rank + 1) * images):
+        for slot in range(team.rank * images, (team.rank + 1) * images):
             # Every choice follows from seed, step and slot, so a resumed run and any number of processes make the same.
             generator = torch.Generator().manual_seed(mixed(self.recipe.seed, step, slot))
             which = order[slot]
@@ -113,16 +120,19 @@ def make_optimizer(avatar: Avatar, config: TrainingConfig) -> torch.optim.Optimi
 
 
 class Curves:
-    """Losses over time, as a small table that is written whole with every checkpoint, and for TensorBoard."""
+    """Losses over time, as a small table that is written whole before every checkpoint, and for TensorBoard."""
 
     def __init__(self, folder: Path, start: int) -> None:
         """Continues the table of an interrupted run up to `start`."""
-        self.file = folder / "curves.csv"
+        self.file = folder / CURVES
         self.rows: list[dict[str, float]] = []
         if start and self.file.is_file():
-            with self.file.open(newline="", encoding="utf-8") as lines:
-                rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(lines)]
-            self.rows = [row for row in rows if row["step"] <= start]
+            try:
+                with self.file.open(newline="", encoding="utf-8") as lines:
+                    rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(lines)]
+                self.rows = [row for row in rows if row["step"] <= start]
+            except (ValueError, TypeError, KeyError):
+                raise TwofoldError(f"{self.file} is damaged; remove it and resume again.") from None
         self.board = SummaryWriter(str(folder / "tensorboard"), purge_step=start)
 
     def add(self, row: dict[str, float]) -> None:
@@ -146,7 +156,8 @@ class Curves:
 
 def train(
     capture: Capture, recipe: Recipe, folder: Path, device: torch.device, resume: bool = False,
-    watch: Callable[[Progress], None] | None = None, before_first: Callable[[Avatar], None] | None = None,
+    watch: Callable[[Progress], None] | None = None, before_first: Callable[[Avatar], str | None] | None = None,
+    preview: Callable[[Avatar, int], None] | None = None,
 ) -> Avatar:  # fmt: skip
     """Trains an avatar and leaves it in `folder`.
 
@@ -157,81 +168,125 @@ def train(
         device: where.
         resume: continue from the folder's checkpoint (from the start where there is none yet).
         watch: called after every step.
-        before_first: called with the new avatar, to attach what is no part of a recipe (perceptual networks).
+        before_first: called with the new avatar, to attach what is no part of a recipe (perceptual networks); what it
+            has to say is noted in the run.
+        preview: called with the avatar and the steps done, from time to time.
 
     Raises:
-        TwofoldError: unusable settings, a checkpoint that does not fit, a loss that is not finite, an unwritable folder.
+        TwofoldError: unusable settings, a checkpoint that does not fit, another capture than the run was begun with,
+            a loss that is not finite, an unwritable folder.
         KeyboardInterrupt: passed on after the state has been stored.
     """
     torch.set_flush_denormal(True)
-    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     config = recipe.training
-    if config.images_per_step % world:
-        raise TwofoldError(f"training.images_per_step is {config.images_per_step}, which {world} processes cannot share.")
-    subject = read_subject(folder) if resume else Subject.of(capture)
-    if not resume and rank == 0:
-        start_folder(folder, recipe, subject, capture.folder)
-    avatar = recipe.method.build(subject, recipe.seed).to(device)
-    if before_first:
-        before_first(avatar)
-    optimizer = make_optimizer(avatar, config)
-    start = 0
-    if resume and (folder / "checkpoint.safetensors").is_file():
-        tensors, start = read_checkpoint(folder)
-        load_state(avatar, {n[7:]: t for n, t in tensors.items() if n.startswith("avatar.")}, folder)
-        load_optimizer(optimizer, tensors)
-    margin = getattr(recipe.method.sampler, "radius", 0.3) + 0.02
-    source = PixelSource(capture.train, subject.body, subject.betas, config.pixels, capture.background, margin)
-    module: nn.Module = Step(avatar, source, torch.tensor(capture.background, device=device), recipe)
-    if world > 1:
-        # Which parameters take part changes with the schedules (poses, pose-dependent branch).
-        module = DistributedDataParallel(module, find_unused_parameters=True)
-    curves = Curves(folder, start) if rank == 0 else None
-    base_rates = [group["lr"] for group in optimizer.param_groups]
-    begun = time.monotonic()
-    with asked_to_stop() as stopped:
+    with (
+        plain_errors(folder), joined(device) as team, asked_to_stop() as stopped, contextlib.ExitStack() as at_the_end
+    ):  # fmt: skip
+        if config.images_per_step % team.size:
+            raise TwofoldError(
+                f"training.images_per_step is {config.images_per_step}, which {team.size} processes cannot share; "
+                "choose a multiple."
+            )
+        subject = _begun_subject(folder, capture) if resume else Subject.of(capture)
+        if not resume and team.leads:
+            require_free(folder)
+        avatar = recipe.method.build(subject, recipe.seed).to(device)
+        note = before_first(avatar) if before_first else None
+        if not resume and team.leads:
+            start_folder(folder, recipe, subject, capture.folder, (note,) if note else ())
+        optimizer = make_optimizer(avatar, config)
+        start = _restore(folder, avatar, optimizer) if resume else 0
+        margin = getattr(recipe.method.sampler, "radius", 0.3) + 0.02
+        source = PixelSource(capture.train, subject.body, subject.betas, config.pixels, capture.background, margin)
+        module: nn.Module = Step(avatar, source, torch.tensor(capture.background, device=device), recipe)
+        if team.size > 1:
+            # Which parameters take part changes with the schedules (poses, pose-dependent branch).
+            module = DistributedDataParallel(module, find_unused_parameters=True, broadcast_buffers=False)
+        curves = Curves(folder, start) if team.leads else None
+        if curves is not None:
+            at_the_end.callback(curves.board.close)
+        base_rates = [group["lr"] for group in optimizer.param_groups]
         for step in range(start, config.steps):
             avatar.before_step(step)
             factor = rate_factor(config, step, len(capture.train))
             for group, rate in zip(optimizer.param_groups, base_rates, strict=True):
                 group["lr"] = rate * factor
-            terms, error = module(step, rank, world)
-            loss = torch.stack(list(terms.values())).sum()
-            if not torch.isfinite(loss):
-                raise TwofoldError(
-                    f"The loss at step {step} is not a finite number; lower the learning rates "
-                    "(--set training.rate_low=...) or check the capture with `twofold check`."
-                )
+            terms, error = module(step, team)
             optimizer.zero_grad(set_to_none=True)
-            loss.backward()
+            losses.total(terms).backward()
             if config.clip:
                 nn.utils.clip_grad_norm_([p for g in optimizer.param_groups for p in g["params"]], config.clip)
             optimizer.step()
             done = step + 1
-            if rank == 0 and curves is not None:
-                report = Progress(done, config.steps, {n: float(t.detach()) for n, t in terms.items()}, _psnr(error))
+            report, stop = _agreed(team, terms, error, stopped(), done, config.steps)
+            if curves is not None:
                 if watch:
                     watch(report)
-                if done % 20 == 0 or done == config.steps:
-                    row = {"step": float(done), **report.losses, "psnr": report.psnr, "beta": float(avatar.beta.detach())}
-                    curves.add(row)
-                if done % config.checkpoint_every == 0 or done == config.steps or stopped():
-                    write_checkpoint(folder, avatar, optimizer, done)
+                if done % ROW_EVERY == 0 or done == config.steps:
+                    curves.add({"step": float(done), **report.losses, "psnr": report.psnr, **_scale(avatar)})
+                if done % config.checkpoint_every == 0 or done == config.steps or stop:
+                    # In this order: the curves are cut back to the checkpoint, not the other way round.
                     curves.save()
-                if config.preview_every and done % config.preview_every == 0 and done < config.steps:
-                    _preview(avatar, capture, folder, done)
-            if stopped():
+                    write_checkpoint(folder, avatar, optimizer, done)
+                if preview and config.preview_every and done % config.preview_every == 0 and done < config.steps:
+                    avatar.eval()
+                    preview(avatar, done)
+                    avatar.train()
+            if stop:
                 raise KeyboardInterrupt
-    if curves is not None:
-        curves.board.add_scalar("seconds", time.monotonic() - begun, config.steps)
-        curves.board.close()
-    if distributed.is_initialized():
-        distributed.barrier()
+        team.wait()
     return avatar.eval()
 
 
+def _begun_subject(folder: Path, capture: Capture) -> Subject:
+    """The subject of an interrupted run, if the capture still shows it."""
+    stored, shown = read_subject(folder).arrays(), Subject.of(capture).arrays()
+    changed = [name for name in stored if not np.array_equal(stored[name], shown.get(name, np.empty(0)))]
+    if changed:
+        raise TwofoldError(
+            f"{capture.folder} is not what {folder} was begun with ({changed[0]} differs); name the right capture or "
+            "start a new run."
+        )
+    return read_subject(folder)
+
+
+def _restore(folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer) -> int:
+    """Puts the checkpoint's state back and tells its step; 0 where there is none yet."""
+    if not (folder / CHECKPOINT).is_file():
+        return 0
+    tensors, start = read_checkpoint(folder)
+    load_state(avatar, {n[7:]: t for n, t in tensors.items() if n.startswith("avatar.")}, folder)
+    load_optimizer(optimizer, tensors)
+    return start
+
+
+def _agreed(
+    team: Team, terms: dict[str, Tensor], error: Tensor, stop: bool, done: int, steps: int
+) -> tuple[Progress, bool]:
+    """What all processes found, averaged, and whether one of them was asked to stop, so that all stop together.
+
+    Raises:
+        TwofoldError: the loss is not a finite number.
+    """
+    values = torch.stack([*(term.detach() for term in terms.values()), error, error.new_tensor(float(stop))])
+    *found, error_mean, stopping = team.mean(values.float()).tolist()
+    named = dict(zip(terms, found, strict=True))
+    if not math.isfinite(sum(found)):
+        raise TwofoldError(
+            f"The loss at step {done - 1} is not a finite number; lower the learning rates "
+            "(--set training.rate_low=... and the others) or look at the capture's pictures and poses."
+        )
+    return Progress(done, steps, named, -10 * math.log10(max(error_mean, 1e-10))), stopping > 0
+
+
+def _scale(avatar: Avatar) -> dict[str, float]:
+    """The density's scale, for the curves of methods that have one."""
+    beta = getattr(avatar, "beta", None)
+    return {"beta": float(beta.detach())} if isinstance(beta, Tensor) else {}
+
+
 @contextlib.contextmanager
-def asked_to_stop() -> Iterator[Callable[[], bool]]:
+def asked_to_stop() -> Generator[Callable[[], bool], None, None]:
     """Ctrl-C as a question that the loop asks between steps, so that no step is ever half applied.
 
     A second Ctrl-C interrupts at once, as usual. Outside the main thread, signals are somebody else's.
@@ -251,22 +306,3 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
         yield lambda: asked
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def _psnr(error: Tensor) -> float:
-    return -10 * float(torch.log10(error.clamp_min(1e-10)))
-
-
-def _preview(avatar: Avatar, capture: Capture, folder: Path, step: int) -> None:
-    """A training picture beside the avatar's, at most 256 pixels high."""
-    frame = capture.train[(step // 7) % len(capture.train)]
-    height = min(256, frame.camera.height)
-    camera = frame.camera.resized(height, round(frame.camera.width * height / frame.camera.height))
-    avatar.eval()
-    posed = avatar.pose(frame.pose, frame.translation, frame.time)
-    picture = draw(avatar, posed, camera, torch.tensor(capture.background))
-    avatar.train()
-    truth = Image.open(frame.image_file).convert("RGB").resize((camera.width, camera.height), Image.Resampling.BOX)
-    drawn = (torch.cat([picture.color, picture.normal * 0.5 + 0.5], 1) * 255).round().to(torch.uint8).numpy()
-    (folder / "previews").mkdir(exist_ok=True)
-    Image.fromarray(np.concatenate([np.asarray(truth), drawn], 1)).save(folder / "previews" / f"{step:06d}.png")

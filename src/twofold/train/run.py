@@ -1,13 +1,14 @@
 """A run: its recipe, its folder, its checkpoints. Everything later starts at `load`."""
 
-import json
+import math
+import os
 import platform
+import shutil
 import sys
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -17,9 +18,14 @@ from twofold import __version__
 from twofold.capture.pixels import PixelConfig
 from twofold.config import from_dict, to_dict
 from twofold.errors import TwofoldError
-from twofold.files import write_atomically, write_json, write_npz
+from twofold.files import new_folder, plain_errors, read_json, read_npz, write_atomically, write_json, write_npz
 from twofold.methods.base import Avatar, Subject
 from twofold.methods.factorized import FactorizedConfig
+
+RECIPE, ABOUT, SUBJECT, CHECKPOINT, CURVES = (
+    "recipe.json", "run.json", "subject.npz", "checkpoint.safetensors", "curves.csv",
+)  # fmt: skip
+"""What a run folder holds. The recipe is written last, so a folder that has one has all it takes to begin."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,7 @@ class TrainingConfig:
     warmup: int = 0
     """Steps over which the rates rise from zero."""
     decay: float = 1.0
-    """What the rates are multiplied with in the end, approached exponentially after `decay_from`; 1 for milestones alone."""
+    """What the rates are multiplied with in the end, approached exponentially after `decay_from`; 1 for no decay."""
     decay_from: float = 0.3
     """Share of the steps before that decay begins."""
     adam_betas: tuple[float, float] = (0.9, 0.999)
@@ -49,6 +55,19 @@ class TrainingConfig:
     """Largest global norm of the gradient; 0 for no limit."""
     checkpoint_every: int = 500
     preview_every: int = 1000
+    """Steps between two preview pictures; 0 for none."""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers with which nothing can be trained."""
+        whole = {n: getattr(self, n) for n in ("steps", "images_per_step", "checkpoint_every")}
+        numbers = {n: getattr(self, n) for n in vars(self) if n.startswith("rate_")}
+        numbers |= {n: getattr(self, n) for n in ("warmup", "decay", "decay_from", "clip", "preview_every")}
+        wrong = [f"{n}={v} should be at least 1" for n, v in whole.items() if v < 1]
+        wrong += [f"{n}={v} should be finite and not negative" for n, v in numbers.items() if not 0 <= v < math.inf]
+        if not all(0 <= beta < 1 for beta in self.adam_betas) or self.adam_epsilon < 0:
+            wrong.append("adam_betas should lie in 0..1, below 1, and adam_epsilon should not be negative")
+        if wrong:
+            raise ValueError("; ".join(wrong))
 
 
 @dataclass(frozen=True)
@@ -62,26 +81,51 @@ class Recipe:
 
 
 def choose_device(name: str) -> torch.device:
-    """The device called `name`; "auto" takes the GPU where there is one.
+    """The device called `name`; "auto" takes the GPU where there is one. Under `torchrun` each process gets its own.
 
     Raises:
         TwofoldError: it is not there.
     """
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
-        device = torch.device(name)
+        device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+        if str(device) == "cuda" and "LOCAL_RANK" in os.environ:
+            device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        if device.type not in ("cpu", "cuda"):
+            raise RuntimeError("kernels are written for these two only")
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError):
-        raise TwofoldError(f"The device {name} is not here; use cpu, or leave --device out.") from None
+        here = [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+        raise TwofoldError(
+            f"The device {name} is not here (there are: {', '.join(['cpu', *here])}); use one of these, or leave "
+            "--device out."
+        ) from None
+    if str(device).startswith("cuda:"):
+        torch.cuda.set_device(device)
     return device
 
 
-def start_folder(folder: Path, recipe: Recipe, subject: Subject, capture: Path) -> None:
-    """Writes what a run is: recipe, subject, versions, where its capture lies."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_npz(folder / "subject.npz", subject.arrays())
-    write_json(folder / "recipe.json", to_dict(recipe))
+def require_free(folder: Path) -> None:
+    """Says no where a new run would mix with something else; one that never came to a checkpoint may begin again.
+
+    Raises:
+        TwofoldError: the folder holds a run with a checkpoint, or other files.
+    """
+    with plain_errors(folder):
+        if (folder / CHECKPOINT).exists():
+            raise TwofoldError(
+                f"{folder} already holds a run; continue it with --resume {folder}, or choose another --out."
+            )
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / SUBJECT).is_file():
+            raise TwofoldError(f"{folder} holds files that are no run; choose another --out.")
+
+
+def start_folder(folder: Path, recipe: Recipe, subject: Subject, capture: Path, notes: tuple[str, ...] = ()) -> None:
+    """Writes what a run is: recipe, subject, versions, where its capture lies, what there is to note.
+
+    Raises:
+        TwofoldError: see `require_free`; or the disk refuses.
+    """
+    require_free(folder)
     packages = {name: metadata.version(name) for name in ("torch", "numpy", "scipy", "safetensors")}
     about = {
         "twofold": __version__,
@@ -90,8 +134,24 @@ def start_folder(folder: Path, recipe: Recipe, subject: Subject, capture: Path) 
         "threads": torch.get_num_threads(),
         "packages": packages,
         "capture": str(capture.resolve()),
+        "notes": list(notes),
     }
-    write_json(folder / "run.json", about)
+
+    def fill(place: Path) -> None:
+        write_npz(place / SUBJECT, subject.arrays())
+        write_json(place / ABOUT, about)
+        write_json(place / RECIPE, to_dict(recipe))
+
+    if folder.is_dir() and any(folder.iterdir()):
+        with plain_errors(folder):
+            (folder / RECIPE).unlink(missing_ok=True)
+            (folder / CURVES).unlink(missing_ok=True)
+            for old in ("tensorboard", "previews"):
+                shutil.rmtree(folder / old, ignore_errors=True)
+        fill(folder)
+    else:
+        with new_folder(folder) as place:
+            fill(place)
 
 
 def read_recipe(folder: Path) -> Recipe:
@@ -100,32 +160,48 @@ def read_recipe(folder: Path) -> Recipe:
     Raises:
         TwofoldError: the folder is no run, or its recipe is damaged.
     """
-    file = folder / "recipe.json"
+    file = folder / RECIPE
     if not file.is_file():
-        raise TwofoldError(f"{folder} is not a run: it has no recipe.json; give the folder that `twofold train` made.")
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError:
-        raise TwofoldError(f"{file} is not valid JSON; it is damaged, train again.") from None
-    return from_dict(Recipe, data, str(file))
+        raise TwofoldError(f"{folder} is not a run: it has no {RECIPE}; give the folder that `twofold train` made.")
+    return from_dict(Recipe, read_json(file), str(file))
 
 
 def read_about(folder: Path) -> dict[str, object]:
-    """What `run.json` says: versions and where the capture lies."""
-    try:
-        return json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise TwofoldError(f"{folder / 'run.json'} is missing or damaged; train again.") from None
+    """What `run.json` says: versions and where the capture lay.
+
+    Raises:
+        TwofoldError: it is missing or damaged.
+    """
+    about = read_json(folder / ABOUT)
+    if not isinstance(about, dict):
+        raise TwofoldError(f"{folder / ABOUT} should hold an object; it is damaged, train again.")
+    return about
+
+
+def find_capture(folder: Path, given: Path | None = None, say: str = "--capture") -> Path:
+    """The capture of a run: `given`, or where `run.json` says that it lay.
+
+    Raises:
+        TwofoldError: it is not there any more; the sentence asks for it by `say`.
+    """
+    if given is not None:
+        return given
+    stored = read_about(folder).get("capture")
+    if not isinstance(stored, str):
+        raise TwofoldError(f"{folder / ABOUT} does not name the run's capture; name it with {say}.")
+    if not Path(stored).is_dir():
+        raise TwofoldError(f"The capture of {folder} is no longer at {stored}; say where it is with {say}.")
+    return Path(stored)
 
 
 def read_subject(folder: Path) -> Subject:
-    """The subject of a run."""
-    file = folder / "subject.npz"
-    try:
-        with np.load(file) as data:
-            return Subject.from_arrays(dict(data), str(file))
-    except (OSError, ValueError):
-        raise TwofoldError(f"{file} is missing or damaged; train again.") from None
+    """The subject of a run.
+
+    Raises:
+        TwofoldError: it is missing or damaged.
+    """
+    file = folder / SUBJECT
+    return Subject.from_arrays(read_npz(file), str(file))
 
 
 def load(folder: Path, device: torch.device | str = "cpu") -> tuple[Avatar, int]:
@@ -153,12 +229,22 @@ def load_state(avatar: Avatar, state: dict[str, Tensor], folder: Path) -> None:
 
 
 def write_checkpoint(folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer, step: int) -> None:
-    """Stores everything that continuing needs, beside the old checkpoint and then in its place."""
+    """Stores everything that continuing needs, beside the old checkpoint and then in its place.
+
+    Raises:
+        TwofoldError: a parameter is not finite, so the old checkpoint stays; or the disk refuses.
+    """
+    broken = [name for name, p in avatar.named_parameters() if not p.isfinite().all()]
+    if broken:
+        raise TwofoldError(
+            f"The training of {folder} diverged: {broken[0]} is not finite at step {step}; lower the learning rates "
+            "(--set training.rate_low=... and the others)."
+        )
     tensors = {f"avatar.{name}": t for name, t in avatar.state_dict().items()}
     for index, values in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{index}.{key}": torch.as_tensor(value) for key, value in values.items()}
     whole = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
-    with write_atomically(folder / "checkpoint.safetensors") as beside:
+    with write_atomically(folder / CHECKPOINT) as beside:
         beside.write_bytes(save(whole, metadata={"step": str(step), "twofold": __version__}))
 
 
@@ -168,7 +254,7 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], int]:
     Raises:
         TwofoldError: there is none, or it cannot be read.
     """
-    file = folder / "checkpoint.safetensors"
+    file = folder / CHECKPOINT
     if not file.is_file():
         raise TwofoldError(f"{folder} has no checkpoint yet; continue it with `twofold train --resume {folder}`.")
     try:
@@ -179,10 +265,18 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], int]:
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Puts stored moments back into an optimizer of the same parameters."""
+    """Puts stored moments back into an optimizer of the same parameters.
+
+    Raises:
+        TwofoldError: they belong to other parameters.
+    """
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         if name.startswith("optimizer."):
             _, index, key = name.split(".")
+            own = int(index) < len(parameters)
+            if not own or (key != "step" and tensor.shape != parameters[int(index)].shape):
+                raise TwofoldError(f"The checkpoint does not fit the optimizer (first at {name}); train again.")
             state.setdefault(int(index), {})[key] = tensor
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
