@@ -1,5 +1,6 @@
 """Recipes: one plain function for each way to train, and the paper's ablations as changes of these."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -117,8 +118,8 @@ def ablation(name: str, start: Recipe) -> Recipe:
         ValueError: there is no such ablation, or the recipe's field has no octaves to change.
     """
     losses, field = start.method.losses, start.method.field
-    if name.startswith("[") and isinstance(field, FactorizedFieldConfig):
-        bands = [int(band) for band in name.strip("[]").split(",")]
+    bands = [int(band) for band in re.findall(r"\d+", name)] if re.fullmatch(r"\[\d+(, ?\d+)?\]", name) else []
+    if bands and isinstance(field, FactorizedFieldConfig):
         if len(bands) == 1:
             field = replace(field, branches="high", high_octaves=bands[0])
         else:
