@@ -1,11 +1,14 @@
 import math
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torch import Tensor
+
 from twofold.geometry.cameras import Rays
-from twofold.volume.rendering import Samples, composite, composite_weights, laplace_density
+from twofold.volume.rendering import Samples, composite, composite_weights, laplace_density, seen_samples
 
 
 def literal_density(s, beta):
@@ -138,3 +141,23 @@ def test_points_lie_on_their_rays():
 def test_no_samples_render_nothing():
     samples, density = packed([0, 0])
     assert composite(composite_weights(density, samples), torch.zeros(0, 3, dtype=torch.float64), samples, 2).sum() == 0
+
+
+@pytest.mark.parametrize("least", [1e-3, 0.05])
+def test_following_rays_from_the_front_finds_the_samples_that_count(least: float) -> None:
+    generator = torch.Generator().manual_seed(3)
+    counts = torch.tensor([0, 40, 1, 7, 25, 0, 60])
+    ray_index = torch.repeat_interleave(torch.arange(7), counts)
+    depth = torch.cat([torch.linspace(1.0, 2.0, int(n)) for n in counts])
+    samples = Samples(ray_index, depth, torch.full_like(depth, 0.01))
+    density = torch.rand(len(depth), generator=generator).pow(4) * 400
+    asked = torch.zeros(len(depth), dtype=torch.long)
+
+    def answer(index: Tensor) -> Tensor:
+        asked[index] += 1
+        return density[index]
+
+    seen = seen_samples(samples, answer, 7, least)
+    assert torch.equal(seen, composite_weights(density, samples) > least)
+    assert asked.max() == 1
+    assert asked.sum() < len(depth)

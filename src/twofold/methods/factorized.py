@@ -24,7 +24,7 @@ from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays, clip_to_box
 from twofold.methods.base import Avatar, PosedAvatar, Rendering, Subject
 from twofold.metrics.perceptual import LPIPS
-from twofold.volume.rendering import Samples, composite, composite_weights, laplace_density
+from twofold.volume.rendering import Samples, composite, composite_weights, laplace_density, seen_samples
 from twofold.volume.samplers import ErrorBoundedSampler
 
 
@@ -301,11 +301,14 @@ class FactorizedAvatar(Avatar):
             nearest, squared = nearest_listed(posed.shell, points, posed.shell.rows_at(points), k)
         shares = neighbour_weights(squared)
         if sampler.least_weight > 0 and len(samples):
+
             with torch.no_grad():
                 x_canonical, _ = to_canonical(points, nearest, shares, posed.forward)
-                sdf = self.field.sdf(x_canonical, posed.condition)
-                weights = composite_weights(laplace_density(sdf, self.beta), samples)
-                seen = weights > sampler.least_weight
+
+            def density(index: Tensor) -> Tensor:
+                return laplace_density(self.field.sdf(x_canonical[index], posed.condition), self.beta)
+
+            seen = seen_samples(samples, density, len(rays), sampler.least_weight)
             samples, nearest, shares = samples[seen], nearest[seen], shares[seen]
         return samples, nearest, shares, torch.zeros(len(samples), dtype=torch.bool, device=points.device)
 

@@ -1,9 +1,10 @@
 """From signed distances to pixels: density, packed samples, compositing."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from twofold.geometry.cameras import Rays
@@ -62,6 +63,47 @@ def composite_weights(
     start = torch.cummax(torch.where(first, torch.arange(len(samples), device=first.device), 0), 0).values
     depth = (before - before[start]).to(optical.dtype)
     return torch.exp(-depth) * -torch.expm1(-optical)
+
+
+@torch.no_grad()
+def seen_samples(
+    samples: Samples, density: Callable[[Int[Tensor, "n"]], Float[Tensor, "n"]], rays: int, least: float, first: int = 8
+) -> Bool[Tensor, "S"]:
+    """Which samples add more than `least` to their pixel, found from front to back.
+
+    Rays are followed a few samples at a time, and no further once less than `least` of their light comes through: what
+    lies behind a surface is never asked for.
+
+    Args:
+        samples: packed.
+        density: of the samples with these indices, per metre.
+        rays: how many there are.
+        least: smallest weight (`composite_weights`) that counts.
+        first: samples a ray is followed by at first; each further stretch is half as long again.
+    """
+    count = len(samples)
+    device = samples.depth.device
+    order = torch.arange(count, device=device)
+    begins = torch.zeros(count, dtype=torch.long, device=device)
+    new = torch.ones(count, dtype=torch.bool, device=device)
+    new[1:] = samples.ray_index[1:] != samples.ray_index[:-1]
+    begins = torch.cummax(torch.where(new, order, begins), 0).values
+    rank = order - begins
+    seen = torch.zeros(count, dtype=torch.bool, device=device)
+    through = torch.ones(rays, device=device)
+    start, length, last = 0, first, int(rank.max()) if count else -1
+    while start <= last:
+        stretch = (rank >= start) & (rank < start + length) & (through > least)[samples.ray_index]
+        index = stretch.nonzero()[:, 0]
+        if len(index):
+            part = samples[index]
+            found = density(index)
+            weights = composite_weights(found, part) * through[part.ray_index]
+            seen[index] = weights > least
+            optical = torch.zeros_like(through).index_add_(0, part.ray_index, found * part.delta)
+            through = through * torch.exp(-optical)
+        start, length = start + length, length + length // 2
+    return seen
 
 
 def composite(
