@@ -126,12 +126,14 @@ def test_page_shows_all_it_was_given(tmp_path: Path) -> None:
 
 
 def test_pictures_are_inside_the_page_pixel_by_pixel(tmp_path: Path) -> None:
-    sources = [str(a["src"]) for a in full_page(tmp_path).all("img")]
+    images = full_page(tmp_path).all("img")
+    sources = [str(a["src"]) for a in images]
     contents = [base64.b64decode(s.removeprefix("data:image/png;base64,"), validate=True) for s in sources]
     arrays = [np.asarray(Image.open(io.BytesIO(content)).convert("RGB")) for content in contents]
     expected = [picture(2), picture(), picture(1), np.zeros((4, 4, 3)), np.full((4, 4, 3), 255)]
     assert len(arrays) == len(expected)
     assert all(np.array_equal(a, e) for a, e in zip(arrays, expected, strict=True))
+    assert [(a["width"], a["height"]) for a in images[:2]] == [("9", "12"), ("9", "12")]
     assert contents[2] == (tmp_path / "kept.png").read_bytes()
 
 
@@ -186,7 +188,7 @@ def test_missing_or_unknown_files_are_one_clear_sentence(tmp_path: Path) -> None
 def test_verdicts_compare_with_their_goal() -> None:
     view = verdict(METRICS, "novel_view.psnr_box", "Novel view", "dB", at_least=26.0)
     assert view == Verdict("Novel view", "27.30", "dB", "goal ≥ 26 dB", True)
-    assert verdict(METRICS, "novel_view.psnr_box", "x", at_least=27.4).met is False
+    assert verdict(METRICS, "novel_view.psnr_box", "x", at_least=28).met is False
     assert verdict(METRICS, "seconds.total", "x", "s", at_most=180.0) == Verdict("x", "151", "s", "goal ≤ 180 s", True)
     assert verdict(METRICS, "seconds.total", "x", "s", at_most=150.0).met is False
     assert verdict(METRICS, "novel_view.pictures", "x") == Verdict("x", "6.00", "", "", None)

@@ -151,8 +151,8 @@ def verdict(
     key: str,
     label: str,
     unit: str = "",
-    at_least: float | None = None,
-    at_most: float | None = None,
+    at_least: float | int | None = None,
+    at_most: float | int | None = None,
 ) -> Verdict:
     """The verdict on one number of a metrics file, named by its dotted key; a dash where it was not measured."""
     value = _found(metrics, key)
@@ -244,8 +244,10 @@ def _verdict(v: Verdict) -> str:
 
 def _figure(figure: Figure) -> str:
     caption = f"<figcaption>{_text(figure.caption)}</figcaption>" if figure.caption else ""
-    source = _embedded(figure.picture)
-    return f'<figure><img src="{source}" alt="{html.escape(figure.caption)}">{caption}</figure>'
+    source, (width, height) = _embedded(figure.picture)
+    wide = " class=wide" if width > 1.2 * height else ""
+    size = f"width={width} height={height}"
+    return f'<figure{wide}><img src="{source}" {size} alt="{html.escape(figure.caption)}">{caption}</figure>'
 
 
 def _film(video: Video) -> str:
@@ -260,17 +262,22 @@ def _legend(chart: Chart) -> str:
     return f"<figcaption><b>{_text(chart.title)}</b>{spans}</figcaption>"
 
 
-def _embedded(picture: Path | Picture) -> str:
+def _embedded(picture: Path | Picture) -> tuple[str, tuple[int, int]]:
+    """The picture as an address that holds it, and its width and height."""
     if isinstance(picture, Path):
         kinds = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
         kind = kinds.get(picture.suffix.lower())
         if kind is None or not picture.is_file():
             problem = "is missing" if kind else f"is no {', '.join(kinds)}"
             raise TwofoldError(f"The report's picture {picture} {problem}.")
-        return f"data:image/{kind};base64,{base64.b64encode(picture.read_bytes()).decode()}"
-    buffer = io.BytesIO()
-    Image.fromarray(as_bytes(picture)).save(buffer, "PNG", optimize=True)
-    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+        content = picture.read_bytes()
+        with Image.open(picture) as image:
+            size = image.size
+    else:
+        kind, buffer, image = "png", io.BytesIO(), Image.fromarray(as_bytes(picture))
+        image.save(buffer, "PNG", optimize=True)
+        content, size = buffer.getvalue(), image.size
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}", size
 
 
 def _table(table: Table) -> str:
@@ -335,12 +342,14 @@ font-variant-numeric:tabular-nums}
 .strip{display:grid;grid-auto-flow:column;grid-auto-columns:minmax(0,1fr);gap:12px;margin:14px 0 6px;align-items:start}
 .charts,.videos{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,420px),1fr));gap:22px;margin:16px 0}
 .videos{grid-template-columns:repeat(auto-fill,minmax(min(100%,300px),1fr))}
-.charts figure{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:14px 16px 8px}
+.charts figure{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:14px 16px 8px;
+max-width:640px}
 .charts figcaption{margin:0 0 6px;display:flex;gap:4px 16px;flex-wrap:wrap}
 .charts b{color:var(--ink);font-weight:600;margin-right:auto}
 .charts span::before{content:"";display:inline-block;width:12px;height:3px;border-radius:2px;background:var(--c);
 margin-right:6px;vertical-align:middle}
 .c0{--c:var(--c0)}.c1{--c:var(--c1)}.c2{--c:var(--c2)}.c3{--c:var(--c3)}.c4{--c:var(--c4)}
+svg{overflow:visible}
 svg text{font-size:13px;fill:var(--faint);font-variant-numeric:tabular-nums}
 .grid{stroke:var(--line)}
 polyline{fill:none;stroke:var(--c);stroke-width:2;stroke-linejoin:round;stroke-linecap:round}
@@ -360,6 +369,7 @@ footer p{margin:0;max-width:80ch}
 .split{grid-template-columns:1fr;gap:26px}.lead{max-width:420px}section{margin-top:22px;padding-top:26px}
 .verdicts{grid-template-columns:1fr 1fr}.value{font-size:25px}svg text{font-size:17px}
 .strip{grid-auto-columns:minmax(148px,1fr);overflow-x:auto;margin-left:-18px;margin-right:-18px;padding:2px 18px 6px}
+.strip .wide{min-width:680px}.strip .wide:not(:only-child){min-width:260px}
 thead{display:none}tr{display:grid;grid-template-columns:1fr auto;border-bottom:1px solid var(--line);padding:7px 0}
 th,td{border:0;padding:0}td:nth-child(3){grid-column:1/-1;font-size:14px}.group{border:0;padding-top:18px}}
 @media print{body{background:#fff}section,figure{break-inside:avoid}}

@@ -19,10 +19,15 @@ def points(element: ElementTree.Element) -> np.ndarray:
     return np.array([[float(v) for v in pair.split(",")] for pair in element.attrib["points"].split()])
 
 
+def as_number(label: str) -> float:
+    units = {"k": 1e3, "M": 1e6}
+    return float(label.replace(",", "").rstrip("kM")) * units.get(label[-1], 1)
+
+
 def height_scale(svg: ElementTree.Element) -> list[tuple[float, float]]:
     """(value, y) of every line of the grid."""
     labels = [t for t in svg.iter("text") if t.attrib["text-anchor"] == "end" and "dy" in t.attrib]
-    return [(float((t.text or "").replace(",", "")), float(t.attrib["y"])) for t in labels]
+    return [(as_number(t.text or ""), float(t.attrib["y"])) for t in labels]
 
 
 def read_off(svg: ElementTree.Element, y: np.ndarray, logarithmic: bool = False) -> np.ndarray:
@@ -92,6 +97,16 @@ def test_nothing_recorded_is_said() -> None:
     assert "Nothing was recorded" in chart_svg(Chart("empty", ()))
 
 
+def test_labels_keep_inside_the_drawing() -> None:
+    svg = drawn(Chart("loss", (Curve("a", [0, 100_000], [0.0012, 123_456.0]),)))
+    for text in svg.iter("text"):
+        x, reach = float(text.attrib["x"]), 7 * len(text.text or "")  # a digit of 13 units' height is some 7 wide
+        right = x + {"middle": reach / 2, "end": 0}[text.attrib["text-anchor"]]
+        left = right - reach
+        assert left >= 0
+        assert right <= WIDTH
+
+
 def test_text_cannot_break_out_of_the_drawing() -> None:
     svg = drawn(Chart('"><script>', (Curve("a", [0, 1], [0.0, 1.0]),), x_label="<b>"))
     assert svg.attrib["aria-label"] == '"><script>'
@@ -105,6 +120,7 @@ def test_ticks_are_round_even_and_inside(low: float, width: float) -> None:
     values = [v for v, _ in ticks]
     assert 1 <= len(ticks) <= 8
     assert all(low - 1e-9 * width <= v <= high + 1e-9 * width for v in values)
+    assert [as_number(label) for _, label in ticks] == pytest.approx(values, rel=1e-6)
     gaps = np.diff(values)
     assert np.allclose(gaps, gaps[:1])
     for gap in gaps[:1]:
@@ -118,4 +134,4 @@ def test_logarithmic_ticks_say_what_they_stand_for(low: float, width: float) -> 
     assert ticks
     for position, label in ticks:
         assert low - 1e-9 <= position <= low + width + 1e-9
-        assert float(label) == pytest.approx(10**position, rel=6e-3)
+        assert as_number(label) == pytest.approx(10**position, rel=6e-3)

@@ -48,12 +48,27 @@ def test_field_is_asked_only_near_the_body_and_in_chunks() -> None:
         asked.append(points)
         return sphere(points)
 
-    extract_surface(level, near, voxel=0.02, radius=0.06, chunk=500)
-    assert max(len(part) for part in asked) == 500
-    distances = torch.cdist(torch.cat(asked), near).amin(1)
-    assert distances.max() < 0.06 + 0.02 * (1 + math.sqrt(3) / 2)
-    everything = torch.cartesian_prod(*[torch.arange(-0.3, 0.3, 0.02) for _ in range(3)]) + CENTER
-    assert len(torch.cat(asked)) >= (torch.cdist(everything, near).amin(1) < 0.06).sum()
+    vertices, faces = extract_surface(level, near, voxel=0.015, radius=0.09, chunk=2000)
+    assert max(len(part) for part in asked) == 2000
+    points = torch.cat(asked)
+    assert len(points.unique(dim=0)) == len(points), "no point twice"
+    assert torch.cdist(points, near).amin(1).max() < 0.09 + 1.5 * 0.015 * math.sqrt(3)
+    everything = torch.cartesian_prod(*[torch.arange(-0.3, 0.3, 0.015) for _ in range(3)]) + CENTER
+    assert len(points) < 0.9 * (torch.cdist(everything, near).amin(1) < 0.09).sum(), "few on the fine grid"
+    assert enclosed_volume(vertices, faces) == pytest.approx(4 / 3 * math.pi * 0.2**3, rel=0.01)
+
+
+@pytest.mark.parametrize("slope", [0.3, 1.0, 1.4])
+def test_thin_things_between_points_of_the_coarse_grid_are_found(slope: float) -> None:
+    """A sphere of one and a half voxels, touching no coarse point, wherever it lies and however steep the field."""
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        center = CENTER + 0.1 * torch.rand(3, generator=generator)
+        near = torch.cat([center[None] + 0.01, on_sphere(0.03, 40)])
+        vertices, _ = extract_surface(
+            lambda x, center=center: slope * sphere(x, 0.015, center), near, voxel=0.01, radius=0.06
+        )
+        assert torch.allclose(vertices.mean(0), center, atol=3e-3)
 
 
 def test_smaller_piece_is_dropped_with_its_vertices() -> None:

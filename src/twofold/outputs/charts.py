@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 480, 260, 54, 10, 10, 40
+WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 480, 260, 54, 26, 10, 40
 """Size of a drawing and its margins, in its own units."""
 BINS = 160
 """Curves with more points are drawn as the means of bins, over the range that each bin spans."""
@@ -86,7 +86,15 @@ def axis_ticks(low: float, high: float, logarithmic: bool = False) -> list[tuple
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(s * power for s in (1, 2, 2.5, 5, 10) if s * power >= 0.999 * rough)
     values = [i * step for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
-    return [(v, f"{10**v:.3g}" if logarithmic else f"{v:,.10g}" if abs(v) < 1e6 else f"{v:g}") for v in values]
+    return [(v, _label(10**v, 4) if logarithmic else _label(v, 10)) for v in values]
+
+
+def _label(value: float, digits: int) -> str:
+    """A number short enough for an axis: 0.005, 2,500, 20k, 1.5M."""
+    for unit, name in ((1e6, "M"), (1e4, "k")):
+        if abs(value) >= unit:
+            return f"{value / (1e6 if name == 'M' else 1e3):,.{digits}g}{name}"
+    return f"{value:,.{digits}g}"
 
 
 def _points(curve: Curve, logarithmic: bool) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The avatar as a triangle mesh: marching cubes in canonical space, then forward skinning into a pose."""
 
 import itertools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -31,34 +32,47 @@ def extract_surface(
 ) -> tuple[Float[Tensor, "W 3"], Int[Tensor, "F 3"]]:
     """The surface where `level` is zero: the connected piece of largest area, triangles counter-clockwise from outside.
 
-    Only grid points near the body are asked for, an eighth of the box around a person.
+    The field is asked on a grid of double width, where that is near the body, and on the fine grid only in those cells
+    that may hold surface: a tenth of the points that the box around a person would have.
 
     Args:
-        level: zero on the surface, negative inside; canonical points in metres.
+        level: a signed distance in metres, zero on the surface, negative inside, of canonical points. Its slope may be
+            up to one and a half; where it is steeper, things thinner than two voxels can be missed.
         near: canonical vertices of the body.
         voxel: edge of a grid cell, metres.
-        radius: how far from these vertices the surface is looked for, metres, give or take a cell.
+        radius: how far from these vertices the surface is looked for, metres, give or take a voxel.
         chunk: points asked for at once.
 
     Raises:
         TwofoldError: there is no surface near the body, or the field gives numbers that are not finite.
     """
+    half_diagonal = math.sqrt(3) * voxel
     low = near.amin(0) - radius - 2 * voxel
-    size = ((near.amax(0) + radius - low) / (2 * voxel)).ceil().long() + 1
-    wanted = _cells_near(near, low, size, voxel, radius)
-    index = wanted.nonzero()
-    values = torch.cat([level(low + voxel * part.to(near.device)) for part in index.split(chunk)])
-    if not values.isfinite().all():
-        raise TwofoldError(
-            "The avatar's field gives numbers that are not finite; its training diverged, train it again."
-        )
-    volume = torch.full(wanted.shape, radius)
-    volume[wanted] = values.float().cpu()
-    if not (values < 0).any() or not (values > 0).any():
+    blocks = [int(n) for n in ((near.amax(0) + radius + 2 * voxel - low) / (2 * voxel)).ceil() + 1]
+    volume = torch.full([2 * n - 1 for n in blocks], torch.nan)
+
+    def ask(index: Int[Tensor, "n 3"]) -> None:
+        parts = [level(low + voxel * part.to(near.device)) for part in index.split(chunk)]
+        values = torch.cat(parts).float().cpu()
+        if not values.isfinite().all():
+            raise TwofoldError("The avatar's field gives numbers that are not finite: its training diverged.")
+        volume[tuple(index.T)] = values
+
+    ask(2 * _points_near(near, low, blocks, 2 * voxel, radius + half_diagonal).nonzero())
+    corners = torch.stack([_shifted(volume[::2, ::2, ::2], corner) for corner in CORNERS])
+    # The nearest corner of a cell is at most half its diagonal away from a surface that passes through it.
+    close = corners.abs().amin(0) < 1.5 * half_diagonal
+    active = (close | (corners.amin(0) * corners.amax(0) <= 0)) & ~corners.isnan().any(0)
+    fine = active.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+    wanted = torch.zeros(volume.shape, dtype=torch.bool)
+    for corner in CORNERS:
+        wanted[tuple(slice(c, n + c) for c, n in zip(corner, fine.shape, strict=True))] |= fine
+    ask((wanted & volume.isnan()).nonzero())
+    if not (volume[wanted] < 0).any() or not (volume[wanted] > 0).any():
         raise TwofoldError(
             f"The avatar has no surface within {100 * radius:g} cm of its body; train it longer, or check its losses."
         )
-    vertices, faces = _marching_cubes(volume.numpy(), wanted.numpy(), voxel)
+    vertices, faces = _marching_cubes(volume.numpy(), fine.numpy(), voxel)
     return keep_largest(low + torch.from_numpy(vertices).to(near), torch.from_numpy(faces).to(near.device))
 
 
@@ -86,27 +100,26 @@ def pose_surface(vertices: Float[Tensor, "n 3"], body: PosedBody, neighbours: in
     return to_posed(vertices, nearest, neighbour_weights(distances.square()), vertex_transforms(body))
 
 
-def _cells_near(near: Tensor, low: Tensor, size: Tensor, voxel: float, radius: float) -> Tensor:
-    """Which points of a grid are within `radius` of a vertex, decided for blocks of 2x2x2 points at their centre."""
-    blocks = torch.stack(torch.meshgrid(*[torch.arange(int(n)) for n in size], indexing="ij"), -1)
-    centers = low.cpu() + voxel * (2 * blocks + 0.5)
-    tree = KDTree(near.detach().cpu().numpy())
-    distances, _ = tree.query(centers.reshape(-1, 3).numpy(), distance_upper_bound=radius + voxel)
-    close = torch.from_numpy(np.isfinite(distances)).reshape(blocks.shape[:3])
-    return close.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+def _points_near(near: Tensor, low: Tensor, shape: list[int], spacing: float, radius: float) -> Tensor:
+    """Which points of a grid are within `radius` of a vertex."""
+    index = torch.stack(torch.meshgrid(*[torch.arange(n) for n in shape], indexing="ij"), -1)
+    points = (low.cpu() + spacing * index).reshape(-1, 3)
+    distances, _ = KDTree(near.detach().cpu().numpy()).query(points.numpy(), distance_upper_bound=radius)
+    return torch.from_numpy(np.isfinite(distances)).reshape(shape)
 
 
-def _marching_cubes(volume: np.ndarray, known: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices relative to the grid's origin, and triangles, of the zero level where all corners of a cell are known."""
+def _shifted(values: Tensor, corner: tuple[int, ...]) -> Tensor:
+    """At each cell of a grid the value at one of its corners."""
+    return values[tuple(slice(c, n - 1 + c) for c, n in zip(corner, values.shape, strict=True))]
+
+
+def _marching_cubes(volume: np.ndarray, cells: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices relative to the grid's origin, and triangles, of the zero level in the chosen cells."""
     # scikit-image takes a cell where its mask holds at the cell's last corner.
-    cells = np.zeros_like(known)
-    corners = [
-        known[tuple(slice(c, n - 1 + c) for c, n in zip(corner, known.shape, strict=True))] for corner in CORNERS
-    ]
-    cells[1:, 1:, 1:] = np.logical_and.reduce(corners)
+    mask = np.pad(cells, ((1, 0), (1, 0), (1, 0)))
     try:
         vertices, faces, _, _ = marching_cubes(
-            volume, 0.0, spacing=(voxel,) * 3, gradient_direction="descent", allow_degenerate=False, mask=cells
+            volume, 0.0, spacing=(voxel,) * 3, gradient_direction="descent", allow_degenerate=False, mask=mask
         )
     except RuntimeError as error:
         raise TwofoldError("The avatar has no surface near its body; train it longer, or check its losses.") from error
