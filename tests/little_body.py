@@ -1,8 +1,10 @@
-"""A body for tests: a sausage around every bone, bending smoothly at the joints."""
+"""Bodies for tests: a sausage around every bone, bending smoothly at the joints; and a plain ball."""
 
 import math
 
+import numpy as np
 import torch
+from scipy.spatial import ConvexHull
 
 from twofold.body.skeleton import PARENTS, Body, PosedBody, pose_body, shape_body
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
@@ -91,3 +93,16 @@ def moved_pose(
     pose = pose.clone()
     pose[0] = matrix_to_axis_angle(rotation @ axis_angle_to_matrix(pose[0]))
     return pose, rotation @ (pelvis + translation) + shift - pelvis
+
+
+def ball(count: int = 150, radius: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
+    """Points spread evenly on a ball that is off the origin, and triangles with counter-clockwise corners outside."""
+    height = 1 - 2 * (np.arange(count) + 0.5) / count
+    turn = np.pi * (1 + 5**0.5) * np.arange(count)
+    side = np.sqrt(1 - height**2)
+    vertices = np.stack([side * np.cos(turn), side * np.sin(turn), height], 1)
+    faces = ConvexHull(vertices).simplices.astype(np.int64)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    inward = (np.cross(b - a, c - a) * a).sum(1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return (radius * vertices + [0.2, -0.1, 0.4]).astype(np.float32), faces
