@@ -1,6 +1,6 @@
 """Time to quality: PSNR over the subject's box on unseen views and poses against seconds of training.
 
-    python -m benchmarks.quality [--threads 2] [--steps 1000] [--seed 0] [--size 192]
+python -m benchmarks.quality [--threads 2] [--steps 1000] [--seed 0] [--size 192]
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from benchmarks.common import store, studio_capture
 
+from benchmarks.common import store, studio_capture
 from twofold.demo import demo_recipe
 from twofold.evaluate import measure_split
 from twofold.methods.base import Avatar

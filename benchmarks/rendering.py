@@ -1,7 +1,7 @@
 """Seconds to render pictures of the demo's kind of avatar: quick and paper-size networks, 256 and 512 square.
 
-The reference form (error-bounded sampler, gradients by autograd) renders a small picture; its seconds for a large one are
-stated as rays times its seconds a ray, since it would take an hour.
+The reference form (error-bounded sampler, gradients by autograd) renders a small picture; its seconds for a large one
+are stated as rays times its seconds a ray, since it would take an hour.
 
     python -m benchmarks.rendering [--threads 2] [--steps 300]
 """
@@ -14,9 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+
 from benchmarks.common import peak_memory_gb, store, studio_capture, timed
 from benchmarks.step import at_work, reference
-
 from twofold.capture.types import Capture
 from twofold.methods.base import Avatar, Subject
 from twofold.outputs.views import draw

@@ -1,8 +1,8 @@
 """A training step at the released network sizes: ours against the reference form, on the same rays, in one run.
 
 The reference form is how the field does it now: error-bounded sampler, every interval shaded, gradients of the distance
-by automatic differentiation through automatic differentiation, float32. Ours samples the shell around the posed body and
-takes the gradients by a hand-written reverse pass. Both have the same networks, losses (without LPIPS) and 1,728 rays.
+by automatic differentiation through automatic differentiation, float32. Ours samples the shell around the posed body
+and takes the gradients by a hand-written reverse pass. Both have the same networks, losses (without LPIPS) and 1,728 rays.
 
     python -m benchmarks.step [--threads 2] [--repeats 5] [--reference-repeats 1]
 """
@@ -14,8 +14,8 @@ import time
 from dataclasses import replace
 
 import torch
-from benchmarks.common import peak_memory_gb, store, studio_capture, timed
 
+from benchmarks.common import peak_memory_gb, store, studio_capture, timed
 from twofold.capture.pixels import PixelSource
 from twofold.methods.base import Avatar, Subject
 from twofold.methods.factorized import FactorizedConfig
@@ -66,7 +66,7 @@ def measure(recipe: Recipe, repeats: int, device: torch.device) -> dict[str, obj
         marks.append(time.perf_counter())
         optimizer.step()
         marks.append(time.perf_counter())
-        for name, begin, end in zip(split, marks, marks[1:]):
+        for name, begin, end in zip(split, marks[:-1], marks[1:], strict=True):
             split[name] += end - begin
         rays, count = len(batch.rays), count + 1
         samples = len(avatar._place(batch.rays, posed, generator)[0]) if count == 1 else samples

@@ -16,12 +16,12 @@ from twofold.evaluate import evaluate, with_protocols
 from twofold.files import write_json
 from twofold.methods.base import Avatar
 from twofold.metrics.image import to_8bit
+from twofold.outputs.charts import Chart, Curve
 from twofold.outputs.gallery import comparison, motion_frames, orbit_frames, panels, save_png, scene_up, spread
 from twofold.outputs.sheets import sheet
 from twofold.outputs.video import write_video
 from twofold.outputs.views import draw, orbit, pose_canonically
 from twofold.recipes import quick
-from twofold.outputs.charts import Chart, Curve
 from twofold.report import Commands, Figure, Row, Section, Video, metrics_table, verdict, write_report
 from twofold.train.loop import Progress, train
 from twofold.train.run import Recipe
@@ -107,7 +107,9 @@ def _pictures(avatar: Avatar, capture: Capture, out: Path) -> list[Path]:
     turning = orbit_frames(avatar, avatar.pose(frame.pose, frame.translation), capture, 256, 24, scene_up(capture))
     write_video(folder / "orbit.mp4", (to_8bit(picture.color).numpy() for picture in turning), 12)
     write_video(folder / "novel_pose.mp4", motion_frames(avatar, capture, "novel_pose", 192), 6)
-    return [folder / name for name in ("novel_view.png", "novel_pose.png", "canonical.png", "orbit.mp4", "novel_pose.mp4")]
+    return [
+        folder / name for name in ("novel_view.png", "novel_pose.png", "canonical.png", "orbit.mp4", "novel_pose.mp4")
+    ]
 
 
 def _one_each(frames: tuple[Frame, ...]) -> list[Frame]:
@@ -120,14 +122,18 @@ def _one_each(frames: tuple[Frame, ...]) -> list[Frame]:
     return chosen or spread(frames, 3)
 
 
-def _page(out: Path, seed: int, metrics: dict[str, object], curve: list[tuple[int, float]], pictures: list[Path]) -> Path:
+def _page(
+    out: Path, seed: int, metrics: dict[str, object], curve: list[tuple[int, float]], pictures: list[Path]
+) -> Path:
     by_name = {path.stem if path.suffix == ".png" else path.name: path for path in pictures}
     steps, values = [step for step, _ in curve], [value for _, value in curve]
-    shown = "Truth, the avatar, and what it is made of: the pose-independent base, what the pose adds, normals, opacity."
+    shown = (
+        "Truth, the avatar, and what it is made of: the pose-independent base, what the pose adds, normals, opacity."
+    )
     sections = [
         Section(
             "Seen from where no camera stood",
-            f"One camera trained the avatar. These are moments of the training motion, seen by the other three. {shown}",
+            f"One camera trained the avatar. These are moments of its motion, seen by the other three. {shown}",
             (Row((Figure(by_name["novel_view"]),)),),
         ),
         Section(
@@ -137,8 +143,8 @@ def _page(out: Path, seed: int, metrics: dict[str, object], curve: list[tuple[in
         ),
         Section(
             "The canonical avatar",
-            "All frames are explained by one person in one pose; the low-frequency branch holds what is the same in all "
-            "of them, the high-frequency branch what comes and goes with the pose.",
+            "All frames are explained by one person in one pose; the low-frequency branch holds what is the same in "
+            "all of them, the high-frequency branch what comes and goes with the pose.",
             (Row((Figure(by_name["canonical"]),)), Video("pictures/orbit.mp4", "All around.")),
         ),
         Section("Training", "", (Chart("PSNR over each step's rays, dB", (Curve("PSNR", steps, values),)),)),

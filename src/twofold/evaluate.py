@@ -1,5 +1,6 @@
 """Evaluation: which frames are measured, how, and the file that says so."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from twofold.capture.types import Capture, Frame
 from twofold.files import write_json
-from twofold.methods.base import Avatar
+from twofold.methods.base import Avatar, PosedAvatar
 from twofold.metrics import image as image_metrics
 from twofold.metrics import shape as shape_metrics
 from twofold.outputs.surface import extract_surface, pose_surface
@@ -50,12 +51,14 @@ def measure_split(
         refined: use the poses as refined in training where a moment was trained on.
         watch: called with every frame and its rendering.
     """
-    rows = []
+    rows, shares = [], []
     frames = evenly(capture.splits.get(split, ()), most)
     for frame in frames:
         picture = draw_frame(avatar, capture, frame, refined)
         image, mask = truth(frame, capture.background)
-        rows.append(image_metrics.compare(picture.color, image, picture.opacity, mask))
+        ignored = frame.ignored()
+        rows.append(image_metrics.compare(picture.color, image, picture.opacity, mask, ignored))
+        shares.append(ignored[image_metrics.subject_box(mask)].float().mean().item())
         if watch:
             watch(frame, picture)
     if not rows:
@@ -64,13 +67,19 @@ def measure_split(
     poses = "as refined in training" if refined else "as the capture gives them"
     times = len({frame.time for frame in frames})
     cameras = len({frame.camera_name for frame in frames})
-    means["protocol"] = {
+    protocol = {
         **image_metrics.PROTOCOLS,
         "frames": f"mean over {len(frames)} pictures of the split {split}: {times} moments, {cameras} cameras",
         "poses": poses,
         "background": f"constant {capture.background}",
     }
-    return means
+    if any(shares):
+        protocol["ignored"] = image_metrics.IGNORED_PROTOCOL.format(share=100 * float(np.mean(shares)))
+    return means | {"protocol": protocol}
+
+
+def _level(avatar: Avatar, posed: PosedAvatar, x: Tensor) -> Tensor:
+    return avatar.level(x.to(posed.forward.device), posed)
 
 
 def measure_geometry(
@@ -85,10 +94,7 @@ def measure_geometry(
     for time in times:
         frame = moments[time]
         posed = avatar.pose(frame.pose, frame.translation, None)
-        device = posed.body.vertices.device
-        surface, faces = extract_surface(
-            lambda x, posed=posed: avatar.level(x.to(device), posed), posed.body.canonical_vertices, voxel
-        )
+        surface, faces = extract_surface(functools.partial(_level, avatar, posed), posed.body.canonical_vertices, voxel)
         vertices = pose_surface(surface, posed.body)
         with np.load(capture.meshes[time]) as mesh:
             true_vertices, true_faces = torch.as_tensor(mesh["vertices"]), torch.as_tensor(mesh["faces"])
@@ -100,8 +106,8 @@ def measure_geometry(
     means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     means["protocol"] = {
         **shape_metrics.PROTOCOLS,
-        "surface": f"marching cubes of the signed distance at {1000 * voxel:g} mm in canonical space, largest piece, posed by "
-        "the 7 nearest body vertices",
+        "surface": f"marching cubes of the signed distance at {1000 * voxel:g} mm in canonical space, largest piece, posed "
+        "by the 7 nearest body vertices",
         "moments": f"mean over {len(rows)} moments with a true mesh",
     }
     return means
@@ -137,8 +143,8 @@ def evaluate(
     if refinement is not None:
         metrics["pose_refinement"] = {
             **refinement.change(),
-            "protocol": "root mean square change of root and body rotations (radians) and translation (metres) over the "
-            "training moments; shape: length of the change of the coefficients",
+            "protocol": "root mean square change of root and body rotations (radians) and translation (metres) over "
+            "the training moments; shape: length of the change of the coefficients",
         }
     metrics |= extra or {}
     write_json(folder / "metrics.json", metrics)

@@ -4,11 +4,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from torch import Tensor
 
 from twofold.geometry.cameras import Rays
-from twofold.volume.rendering import Samples, composite, composite_weights, laplace_density, seen_samples
+from twofold.geometry.samples import Samples
+from twofold.volume.rendering import composite, composite_weights, laplace_density, seen_samples
 
 
 def literal_density(s, beta):

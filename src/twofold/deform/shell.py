@@ -15,8 +15,8 @@ from torch import Tensor
 
 from twofold.deform import shell_kernels
 from twofold.geometry.cameras import Rays, clip_to_box
+from twofold.geometry.samples import Samples
 from twofold.geometry.threads import in_parts
-from twofold.volume.rendering import Samples
 
 
 @dataclass(frozen=True)

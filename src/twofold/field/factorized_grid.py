@@ -250,5 +250,5 @@ class GridField(nn.Module):
         if to_observation is not None:
             gradient = (to_observation.detach() * gradient[:, None]).sum(-1)
         normal = F.normalize(gradient, dim=-1)
-        # Polynomials of degree two, as in spherical-harmonics lighting: what a diffuse surface shows of any surroundings.
+        # Polynomials of degree two, as in spherical-harmonics lighting: all that a diffuse surface shows of a scene.
         return torch.exp(self.light(torch.cat([normal, normal * normal, normal * normal.roll(1, -1)], -1)))

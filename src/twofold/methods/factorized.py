@@ -22,9 +22,10 @@ from twofold.field.factorized import FactorizedFieldConfig
 from twofold.field.factorized_grid import GridFieldConfig
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays, clip_to_box
+from twofold.geometry.samples import Samples
 from twofold.methods.base import Avatar, PosedAvatar, Rendering, Subject
 from twofold.metrics.perceptual import LPIPS
-from twofold.volume.rendering import Samples, composite, composite_weights, laplace_density, seen_samples
+from twofold.volume.rendering import composite, composite_weights, laplace_density, seen_samples
 from twofold.volume.samplers import ErrorBoundedSampler
 
 
@@ -301,7 +302,6 @@ class FactorizedAvatar(Avatar):
             nearest, squared = nearest_listed(posed.shell, points, posed.shell.rows_at(points), k)
         shares = neighbour_weights(squared)
         if sampler.least_weight > 0 and len(samples):
-
             with torch.no_grad():
                 x_canonical, _ = to_canonical(points, nearest, shares, posed.forward)
 

@@ -1,39 +1,12 @@
 """From signed distances to pixels: density, packed samples, compositing."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from twofold.geometry.cameras import Rays
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Samples of many rays in one flat list, grouped by ray and ordered by depth; a ray may have none.
-
-    Attributes:
-        ray_index: the ray each sample lies on, ascending.
-        depth: where on that ray, metres.
-        delta: length of ray that the sample stands for, metres.
-    """
-
-    ray_index: Int[Tensor, "S"]
-    depth: Float[Tensor, "S"]
-    delta: Float[Tensor, "S"]
-
-    def points(self, rays: Rays) -> Float[Tensor, "S 3"]:
-        """Positions in the world."""
-        origins, directions = rays.origins[self.ray_index], rays.directions[self.ray_index]
-        return origins + self.depth[:, None] * directions
-
-    def __getitem__(self, index: Tensor) -> "Samples":
-        return Samples(self.ray_index[index], self.depth[index], self.delta[index])
-
-    def __len__(self) -> int:
-        return len(self.depth)
+from twofold.geometry.samples import Samples
 
 
 def laplace_density(sdf: Float[Tensor, "*b"], beta: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
@@ -50,9 +23,7 @@ def laplace_density(sdf: Float[Tensor, "*b"], beta: Float[Tensor, ""]) -> Float[
     return torch.where(sdf > 0, tail, 1 - tail) / beta
 
 
-def composite_weights(
-    density: Float[Tensor, "S"], samples: Samples
-) -> Float[Tensor, "S"]:
+def composite_weights(density: Float[Tensor, "S"], samples: Samples) -> Float[Tensor, "S"]:
     """What each sample adds to its ray, T_i (1 - exp(-sigma_i delta_i)); a ray's weights sum to at most one."""
     optical = density * samples.delta
     # One running sum over all rays would lose digits in float32; what a ray starts with is taken off again.

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from twofold.geometry.cameras import Rays
-from twofold.volume.rendering import Samples, laplace_density
+from twofold.geometry.samples import Samples
+from twofold.volume.rendering import laplace_density
 
 PDF_FLOOR = 1e-6
 """Added to every section where depths are refined, so that none is left out."""
