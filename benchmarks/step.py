@@ -2,7 +2,8 @@
 
 The reference form is how the field does it now: error-bounded sampler, every interval shaded, gradients of the distance
 by automatic differentiation through automatic differentiation, float32. Ours samples the shell around the posed body
-and takes the gradients by a hand-written reverse pass. Both have the same networks, losses (without LPIPS) and 1,728 rays.
+and takes the gradients by a hand-written reverse pass. Both have the same networks, losses (without LPIPS) and 1,728
+rays.
 
     python -m benchmarks.step [--threads 2] [--repeats 5] [--reference-repeats 1]
 """

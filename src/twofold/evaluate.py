@@ -106,8 +106,8 @@ def measure_geometry(
     means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     means["protocol"] = {
         **shape_metrics.PROTOCOLS,
-        "surface": f"marching cubes of the signed distance at {1000 * voxel:g} mm in canonical space, largest piece, posed "
-        "by the 7 nearest body vertices",
+        "surface": f"marching cubes of the signed distance at {1000 * voxel:g} mm in canonical space, largest piece, "
+        "posed by the 7 nearest body vertices",
         "moments": f"mean over {len(rows)} moments with a true mesh",
     }
     return means
