@@ -88,7 +88,7 @@ def import_capture(
         out: Folder to make.
         held_out: Of so many frames one is kept for testing.
         drop_below_iou: Leaves out frames whose fitted body covers the mask worse than this, 0 to 1.
-        held_objects: Whether what is thick and sticks out of the body, such as a ball, leaves the masks.
+        held_objects: Whether a ball or the like that sticks out of or passes in front of the body is taken out.
     """
     from twofold.capture.prepared import import_prepared
 

@@ -225,3 +225,17 @@ def test_what_is_no_capture_gets_one_sentence(tmp_path, make, sentence):
     with pytest.raises(TwofoldError, match=sentence) as caught:
         read_capture(tmp_path / "a")
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_ignored_pixels_are_written_and_give_way_with_the_rest(tmp_path):
+    layer = np.zeros((40, 48), np.uint8)
+    layer[4:9, 7:11] = 255
+    write_tiny(tmp_path / "plain")
+    folder = write_tiny(tmp_path / "hidden", ignored={("front", 2): layer})
+    frames = {frame.time: frame for frame in read_capture(folder).train}
+    np.testing.assert_array_equal(frames[2].ignored().numpy(), layer > 0)
+    assert frames[1].ignored_file is None
+    files = every_file(folder)
+    assert set(files) - set(every_file(tmp_path / "plain")) == {"ignored/front/000002.png"}
+    write_tiny(folder, overwrite=True)
+    assert every_file(folder) == every_file(tmp_path / "plain")

@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from little_body import little_body
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_capture import HEIGHT, WIDTH, stick_body
 
 from twofold.body.skeleton import PARENTS, ShapedBody, pose_body, shape_body
 from twofold.capture.folder import read_capture
+from twofold.capture.masks import body_silhouette
 from twofold.capture.prepared import ORIGINS, Origin, import_prepared, turn_world
 from twofold.capture.validate import validate
 from twofold.errors import TwofoldError
@@ -216,7 +218,7 @@ def test_what_is_no_prepared_capture_is_one_sentence(tmp_path):
 def test_real_people_stand_inside_their_masks(name, tmp_path):
     if not (REAL / name).is_dir():
         pytest.skip(f"the prepared capture {name} is not at {REAL} (set TWOFOLD_PREPARED)")
-    capture = read_capture(import_prepared(REAL / name, tmp_path / name))
+    capture = read_capture(import_prepared(REAL / name, tmp_path / name, held_objects="keep"))
     assert capture.credit
     assert all(frame.time % 10 == 5 for frame in capture.splits["novel_pose"])
     for frame in (*capture.splits["novel_pose"], capture.train[0], capture.train[-1]):
@@ -234,3 +236,56 @@ def test_real_people_stand_inside_their_masks(name, tmp_path):
     torch.testing.assert_close(after.joints @ world.T, before.joints, atol=1e-4, rtol=0)
     # Skinning twice is not skinning once, so the skin moves a little where joints blend.
     assert (after.vertices @ world.T - before.vertices).norm(dim=-1).mean() < 0.001
+
+
+@pytest.fixture(scope="module")
+def juggler(tmp_path_factory):
+    """A prepared capture of somebody in front of whom a ball passes once, and the ball's pixels."""
+    folder = tmp_path_factory.mktemp("juggler") / "juggler"
+    (folder / "images").mkdir(parents=True)
+    (folder / "masks").mkdir()
+    body, height, width = little_body(), 120, 100
+    intrinsics = np.array([[150.0, 0, 50], [0, 150, 40], [0, 0, 1]])
+    poses, translations = np.zeros((8, 24, 3)), np.tile([0.0, 0.3, 3.5], (8, 1))
+    poses[:, 0, 0] = np.pi  # the camera's y points down
+    translations[:, 0] = np.linspace(-0.1, 0.1, 8)
+    joint_of = np.zeros(len(body.template), dtype=int)  # the whole body turns with its root
+    ball = np.hypot(*(np.mgrid[:height, :width] - np.array([45, 50])[:, None, None])) <= 6
+    for time in range(8):
+        _, moved = posed_reference(
+            body.joints.numpy(), body.template.numpy(), joint_of, poses[time], translations[time]
+        )
+        pixels = moved @ intrinsics.T
+        mask = body_silhouette(pixels[:, :2] / pixels[:, 2:], body.faces.numpy(), height, width) | (ball & (time == 3))
+        image = np.where(mask[..., None], (60, 80, 140), (20, 90, 20)).astype(np.uint8)
+        image[ball & (time == 3)] = 240
+        Image.fromarray(mask * np.uint8(255)).save(folder / f"masks/{time:04d}.png")
+        Image.fromarray(image).save(folder / f"images/{time:04d}.png")
+    np.savez(
+        folder / "capture.npz", intrinsics=intrinsics, world_to_camera=np.eye(4), poses=poses, transl=translations,
+        rest_vertices=body.template.numpy(), rest_joints=body.joints.numpy(), parents=np.array(PARENTS),
+        weights=body.weights.numpy(), faces=body.faces.numpy(),
+    )  # fmt: skip
+    return folder, ball
+
+
+def test_a_ball_that_passes_in_front_is_ignored_in_that_frame_alone(juggler, tmp_path):
+    source, ball = juggler
+    folder = import_prepared(source, tmp_path / "out")
+    capture = read_capture(folder)
+    for frame in capture.train:
+        hidden = frame.ignored().numpy()
+        assert hidden.any() == (frame.time == 3)
+        assert hidden[ball].mean() > 0.85 or frame.time != 3
+        assert hidden.sum() < 1.7 * ball.sum()
+    notes = json.loads((folder / "capture.json").read_text())["notes"]
+    assert notes["objects_ignored"] == [3]
+    assert [share > 0 for share in notes["objects_share_of_mask"]] == [time == 3 for time in range(8)]
+    assert validate(folder) == []
+
+
+def test_objects_are_kept_on_request(juggler, tmp_path):
+    source, _ = juggler
+    folder = import_prepared(source, tmp_path / "out", held_objects="keep")
+    assert not (folder / "ignored").exists()
+    assert (folder / "masks/cam/000003.png").read_bytes() == (source / "masks/0003.png").read_bytes()

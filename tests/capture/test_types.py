@@ -40,3 +40,14 @@ def test_train_is_the_train_split(tiny):
     capture = read_capture(tiny)
     assert capture.train is capture.splits["train"]
     assert [frame.time for frame in capture.train] == [0, 1, 2, 3]
+
+
+def test_ignored_pixels_are_read_and_none_are_where_there_is_no_file(tiny):
+    assert not read_capture(tiny).train[1].ignored().any()
+    layer = np.zeros((40, 48), np.uint8)
+    layer[3:9, 5:7] = 255
+    (tiny / "ignored/front").mkdir(parents=True)
+    Image.fromarray(layer).save(tiny / "ignored/front/000001.png")
+    frames = read_capture(tiny).train
+    assert torch.equal(frames[1].ignored(), torch.from_numpy(layer > 0))
+    assert not frames[2].ignored().any()

@@ -262,3 +262,26 @@ def test_cameras_of_the_tiny_capture_see_the_same_body():
     points = torch.tensor([[0.0, 0.0, 0.0]])
     for camera in tiny_cameras().values():
         assert project(camera, points)[0].tolist() == [[23.5, 19.5]]
+
+
+@pytest.mark.parametrize(
+    ("layer", "sentence"),
+    [
+        (np.zeros((HEIGHT, WIDTH), np.uint8), ""),
+        (np.zeros((HEIGHT, WIDTH + 1), np.uint8), "ignored/front/000001.png has 49 x 40 pixels, its camera 48 x 40"),
+        (np.zeros((HEIGHT, WIDTH, 3), np.uint8), "one 8-bit channel, 255 where nothing is known of the person; it is"),
+        (np.full((HEIGHT, WIDTH), 255, np.uint8), "ignored/front/000001.png ignores all of the person"),
+    ],
+)
+def test_a_layer_of_ignored_pixels_is_optional_and_checked(tiny, layer, sentence):
+    (tiny / "ignored/front").mkdir(parents=True)
+    Image.fromarray(layer).save(tiny / "ignored/front/000001.png")
+    faults = validate(tiny)
+    assert sentence in only(faults) if sentence else faults == []
+
+
+def test_a_damaged_layer_of_ignored_pixels_is_named(tiny):
+    (tiny / "ignored/front").mkdir(parents=True)
+    whole = (tiny / "masks/front/000001.png").read_bytes()
+    (tiny / "ignored/front/000001.png").write_bytes(whole[:60])
+    assert any("ignored/front/000001.png" in fault for fault in validate(tiny))

@@ -1,5 +1,6 @@
 """A tiny capture to break: a stick figure in front of two cameras."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -58,8 +59,13 @@ SPLITS = {
 }
 
 
-def write_tiny(folder: Path, overwrite: bool = False, **changes: object) -> Path:
-    """Writes the tiny capture; `changes` replace arguments of `finish`."""
+def write_tiny(
+    folder: Path,
+    overwrite: bool = False,
+    ignored: Mapping[tuple[str, int], np.ndarray] | None = None,
+    **changes: object,
+) -> Path:
+    """Writes the tiny capture; `ignored` are layers by camera and time, `changes` replace arguments of `finish`."""
     body, betas, (poses, translations), cameras = stick_body(), torch.tensor([0.5]), tiny_motion(), tiny_cameras()
     shaped = shape_body(body, betas)
     with CaptureWriter(folder, overwrite) as writer:
@@ -75,6 +81,8 @@ def write_tiny(folder: Path, overwrite: bool = False, **changes: object) -> Path
                 image[rows, columns] = (200, 100, 50)
                 writer.image(name, time, image)
                 writer.mask(name, time, mask)
+        for (name, time), layer in (ignored or {}).items():
+            writer.ignored(name, time, layer)
         arguments = {
             "name": "tiny", "body": body, "betas": betas, "poses": poses, "translations": translations,
             "cameras": cameras, "splits": SPLITS, "fps": 10.0, "background": (0.1, 0.2, 0.3), "credit": "nobody",

@@ -126,3 +126,26 @@ def test_every_figure_has_its_protocol() -> None:
     assert figures["silhouette_iou"] == 1
     assert figures["psnr_box"] == psnr_box(image, truth, mask)
     assert figures["ssim_range_2"] > figures["ssim"]
+
+
+def test_ignored_pixels_change_no_figure_and_the_rest_is_measured() -> None:
+    image, truth = pair(6)
+    mask, opacity = torch.zeros(40, 33), torch.zeros(40, 33)
+    mask[5:35, 5:28], opacity[8:36, 5:28] = 1, 1
+    ignored = torch.zeros(40, 33, dtype=torch.bool)
+    ignored[6:14, 8:20] = True
+    figures = compare(image, truth, opacity, mask, ignored)
+    spoilt, emptied = torch.where(ignored[..., None], 1 - truth, image), torch.where(ignored, 1 - opacity, opacity)
+    assert compare(spoilt, truth, emptied, mask, ignored) == figures
+    assert figures["psnr"] == psnr(image, truth, ~ignored)
+    assert figures["silhouette_iou"] == silhouette_iou(opacity * ~ignored, mask * ~ignored)
+    assert compare(image, truth, opacity, mask, torch.zeros_like(ignored)) == compare(image, truth, opacity, mask)
+
+
+def test_ssim_counts_the_windows_that_touch_nothing_ignored() -> None:
+    image, truth = pair(7)
+    ignored = torch.zeros(40, 33, dtype=torch.bool)
+    ignored[:, 20:] = True
+    assert ssim(image, truth, ignored=ignored) == pytest.approx(ssim(image[:, :20], truth[:, :20]), abs=1e-12)
+    with pytest.raises(TwofoldError, match="Every window"):
+        ssim(image, truth, ignored=torch.ones(40, 33, dtype=torch.bool))

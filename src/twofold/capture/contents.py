@@ -23,7 +23,7 @@ from twofold.geometry.cameras import Camera
 
 FORMAT, VERSION = "twofold-capture", 1
 DESCRIPTION, BODY, MOTION = "capture.json", "body.npz", "motion.npz"
-IMAGES, MASKS, MESHES = "images", "masks", "meshes"
+IMAGES, MASKS, IGNORED, MESHES = "images", "masks", "ignored", "meshes"
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg")
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 """Camera names are folder names, so nothing that leaves the folder or breaks on another system."""
@@ -69,7 +69,7 @@ class Contents:
         return {camera: sorted(times) for camera, times in wanted.items()}
 
     def files(self, kind: str, camera: str) -> dict[int, Path]:
-        """The pictures there are of one camera, by time; `kind` is "images" or "masks"."""
+        """The pictures there are of one camera, by time; `kind` is "images", "masks" or "ignored"."""
         return numbered_files(self.folder / kind / camera, PICTURE_ENDINGS)
 
 

@@ -19,6 +19,7 @@ from twofold.capture.contents import (
     BODY,
     DESCRIPTION,
     FORMAT,
+    IGNORED,
     IMAGES,
     MASKS,
     MESHES,
@@ -50,6 +51,7 @@ def read_capture(folder: Path | str) -> Capture:
         raise AssertionError("a part that cannot be read is a fault, and faults were raised above")
     images = {camera: contents.files(IMAGES, camera) for camera in contents.pictures}
     masks = {camera: contents.files(MASKS, camera) for camera in contents.pictures}
+    ignored = {camera: contents.files(IGNORED, camera) for camera in contents.pictures}
     splits = {
         split: tuple(
             Frame(
@@ -60,6 +62,7 @@ def read_capture(folder: Path | str) -> Capture:
                 translation=translations[time],
                 image_file=images[name][time],
                 mask_file=masks[name][time],
+                ignored_file=ignored[name].get(time),
             )
             for name, time in pictures
         )
@@ -131,6 +134,10 @@ class CaptureWriter:
     def mask(self, camera: str, time: int, mask: UInt8[np.ndarray, "h w"]) -> None:
         """Its mask, 0 outside .. 255 on the person, as PNG."""
         self._picture(MASKS, camera, time, mask)
+
+    def ignored(self, camera: str, time: int, ignored: UInt8[np.ndarray, "h w"]) -> None:
+        """Where nobody knows what the person looks like there (255, else 0), as PNG; pictures may do without."""
+        self._picture(IGNORED, camera, time, ignored)
 
     def image_file(self, camera: str, time: int, source: Path) -> None:
         """A picture file (PNG or JPEG) taken over as it is, so that nothing is lost in coding it anew."""
@@ -214,7 +221,7 @@ class CaptureWriter:
             found = {path.name for path in self._folder.iterdir()} if self._folder.is_dir() else set[str]()
         if not found:
             return False
-        foreign = found - {DESCRIPTION, BODY, MOTION, IMAGES, MASKS, MESHES}
+        foreign = found - {DESCRIPTION, BODY, MOTION, IMAGES, MASKS, IGNORED, MESHES}
         if DESCRIPTION not in found or foreign:
             holds = f"{sorted(foreign)[0]}, which is no part of a capture" if foreign else "files that are no capture"
             raise TwofoldError(f"The folder {self._folder} holds {holds}; choose another name.")

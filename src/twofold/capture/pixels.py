@@ -41,7 +41,7 @@ class Batch:
         color: what the picture shows, on the capture's background, 0..1.
         mask: share of the pixel that the person covers.
         singles: how many of the rays are single pixels.
-        patch_pixels: for each pixel of each patch, its ray, or -1 outside the body's box.
+        patch_pixels: for each pixel of each patch, its ray, or -1 outside the body's box and where pixels are ignored.
     """
 
     rays: Rays
@@ -86,7 +86,7 @@ class PixelSource:
         """The frame's picture and the pixels that may be drawn.
 
         Raises:
-            TwofoldError: its mask shows nobody.
+            TwofoldError: its mask shows nobody, or nobody who is not ignored.
         """
         if which not in self._pictures:
             self._pictures[which] = self._read(self.frames[which])
@@ -120,6 +120,14 @@ class PixelSource:
         else:
             off = np.asarray(ndimage.distance_transform_edt(~inside.numpy()))
             subject = torch.from_numpy(off <= self.config.surroundings)
+        # Where something hides the person there is nothing to learn.
+        known = ~frame.ignored()
+        reachable &= known
+        inside = inside & known
+        if not inside.any():
+            raise TwofoldError(
+                f"{frame.ignored_file} ignores all of the person; leave the picture out of the training frames."
+            )
         subject &= reachable
         return _Picture(
             (image * 255).round().to(torch.uint8),
@@ -160,7 +168,7 @@ class PixelSource:
         )
 
     def _patch(self, picture: _Picture, reachable: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Pixels of one patch and their places in it; those that cannot meet the body are left out."""
+        """Pixels of one patch and their places in it; those that cannot meet the body or are ignored are left out."""
         size = self.config.patch_size
         height, width = picture.image.shape[:2]
         on_subject = bool(torch.rand((), generator=generator) < self.config.patch_on_subject)

@@ -4,21 +4,22 @@ The fitted body comes in a rest pose of its own, its arms hanging at an angle; i
 T-pose. The world is turned from the camera's axes to y up.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
 from twofold.body.retarget import convert_pose, straighten
-from twofold.body.skeleton import PARENTS, Body, PosedBody, pose_body, shape_body
+from twofold.body.skeleton import PARENTS, Body, pose_body, shape_body
 from twofold.capture.contents import spans
 from twofold.capture.folder import CaptureWriter
-from twofold.capture.masks import body_silhouette, remove_held_objects
+from twofold.capture.masks import SeenBody, see_body, usual_colors, without_objects
 from twofold.errors import TwofoldError
 from twofold.files import read_npz
 from twofold.geometry.cameras import Camera, project
@@ -71,7 +72,8 @@ def import_prepared(
         drop_below_iou: frames whose fitted body covers the mask worse than this are in no split; the notes name them.
         origin: frames per second and credit; None takes those of `ORIGINS`, else 30 and no credit.
         overwrite: a capture that lies at `out` gives way.
-        held_objects: whether what is thick and sticks out of the body, such as a ball, is taken out of the masks.
+        held_objects: "remove" takes what is thick and sticks out of the body, such as a ball, out of the masks, and
+            marks it and what passes in front of the body as ignored; "keep" leaves the masks as they are.
 
     Returns:
         `out`.
@@ -94,17 +96,19 @@ def import_prepared(
     held_out = [time for time in kept if time % every_held_out == every_held_out // 2]
     origin = origin or ORIGINS.get(source.name, Origin(30.0, ""))
     with CaptureWriter(out, overwrite) as writer:
-        cleaned: list[int] = []
-        shaped = shape_body(body, torch.zeros(0))
         for time in kept:
             writer.image_file(CAMERA, time, images[time])
-            posed = pose_body(shaped, poses[time].float(), translations[time].float())
-            mask = _without_objects(masks[time], posed, camera) if held_objects == "remove" else None
-            if mask is None:
-                writer.mask_file(CAMERA, time, masks[time])
-            else:
-                writer.mask(CAMERA, time, mask)
-                cleaned.append(time)
+        shares = dict.fromkeys(kept, 0.0)
+        whole = set(kept)
+        if held_objects == "remove":
+            for time, mask, hidden, share in _without_objects(body, poses, translations, camera, images, masks):
+                shares[time] = round(share, 3)
+                if hidden.any():
+                    writer.mask(CAMERA, time, mask)
+                    writer.ignored(CAMERA, time, hidden * np.uint8(255))
+                    whole.remove(time)
+        for time in sorted(whole):
+            writer.mask_file(CAMERA, time, masks[time])
         writer.finish(
             name=source.name,
             body=body,
@@ -123,7 +127,9 @@ def import_prepared(
                 "every_held_out": every_held_out,
                 "drop_below_iou": drop_below_iou,
                 "left_out": left_out,
-                "held_objects_removed": cleaned,
+                "held_objects": held_objects,
+                "objects_ignored": [time for time in kept if time not in whole],
+                "objects_share_of_mask": list(shares.values()),
                 "video_frame": arrays["video_frame"].tolist(),
                 "silhouette_iou": [round(float(iou), 3) for iou in arrays["silhouette_iou"]],
             },
@@ -131,18 +137,44 @@ def import_prepared(
     return out
 
 
-def _without_objects(file: Path, posed: PosedBody, camera: Camera) -> UInt8[np.ndarray, "h w"] | None:
-    """A mask without held objects, or None where there is nothing to remove."""
+def _without_objects(
+    body: Body,
+    poses: Float[Tensor, "T 24 3"],
+    translations: Float[Tensor, "T 3"],
+    camera: Camera,
+    images: dict[int, Path],
+    masks: dict[int, Path],
+) -> Iterator[tuple[int, UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"], float]]:
+    """Time, mask without held objects, hidden pixels and their share of the mask, where a frame can be judged.
+
+    Pictures are read twice, so that a long capture needs no memory for them.
+    """
+    shaped, focal = shape_body(body, torch.zeros(0)), float(camera.intrinsics[0, 0])
+    bodies: dict[int, SeenBody] = {}
+    colors: list[np.ndarray] = []
+    visible: list[np.ndarray] = []
+    for time, image_file in images.items():
+        posed = pose_body(shaped, poses[time].float(), translations[time].float())
+        pixels, depth = project(camera, posed.vertices)
+        image, mask = _pixels(image_file, "RGB"), _pixels(masks[time], "L")
+        size = (camera.height, camera.width)
+        if depth.min() <= 0 or image.shape[:2] != size or mask.shape != size:
+            continue  # The writer tells what is wrong with it.
+        seen = see_body(pixels.numpy(), depth.numpy(), posed.faces.numpy(), focal, *size)
+        column, row = np.where(seen.visible[:, None], seen.pixels, 0).T
+        colors.append(image[row, column])
+        visible.append(seen.visible & (mask[row, column] > 127))
+        bodies[time] = seen
+    if not bodies:
+        return
+    usual, trusted = usual_colors(np.stack(colors), np.stack(visible))
+    for time, seen in bodies.items():
+        yield time, *without_objects(_pixels(masks[time], "L"), _pixels(images[time], "RGB"), seen, usual, trusted)
+
+
+def _pixels(file: Path, mode: Literal["L", "RGB"]) -> UInt8[np.ndarray, "h w *c"]:
     with Image.open(file) as picture:
-        mask = np.asarray(picture.convert("L"))
-    if mask.shape != (camera.height, camera.width):
-        return None  # The writer tells what is wrong with it.
-    pixels, depth = project(camera, posed.vertices)
-    if depth.min() <= 0:
-        return None
-    body = body_silhouette(pixels.numpy(), posed.faces.numpy(), camera.height, camera.width)
-    kept = remove_held_objects(mask > 127, body, float(camera.intrinsics[0, 0] / depth.median()))
-    return None if (kept == (mask > 127)).all() else np.where(kept | (mask <= 127), mask, 0).astype(np.uint8)
+        return np.asarray(picture.convert(mode))
 
 
 def turn_world(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
@@ -28,6 +28,7 @@ class Frame:
         translation: SMPL's own (the root turns about its rest joint, then this is added), metres.
         image_file: PNG or JPEG, 8-bit sRGB.
         mask_file: one channel, 0 outside .. 255 on the person.
+        ignored_file: one channel, 255 where nobody knows what the person looks like; None where all is known.
     """
 
     time: int
@@ -37,6 +38,7 @@ class Frame:
     translation: Float[Tensor, "3"]
     image_file: Path
     mask_file: Path
+    ignored_file: Path | None = None
 
     def image(self) -> Float[Tensor, "h w 3"]:
         """Colours in 0..1, as stored (background included)."""
@@ -47,6 +49,13 @@ class Frame:
         """Share of each pixel that the person covers, 0..1."""
         with Image.open(self.mask_file) as picture:
             return torch.from_numpy(np.array(picture.convert("L"), dtype=np.float32) / 255)
+
+    def ignored(self) -> Bool[Tensor, "h w"]:
+        """Pixels that are neither learned from nor measured, because something passes in front of the person."""
+        if self.ignored_file is None:
+            return torch.zeros(self.camera.height, self.camera.width, dtype=torch.bool)
+        with Image.open(self.ignored_file) as picture:
+            return torch.from_numpy(np.array(picture.convert("L")) > 127)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from twofold.body.skeleton import joint_transforms, shape_body
 from twofold.capture.contents import (
+    IGNORED,
     IMAGES,
     MASKS,
     MESHES,
@@ -33,6 +34,11 @@ from twofold.geometry.cameras import Camera, project
 
 Item = TypeVar("Item")
 _IMAGE_MODES, _MASK_MODES = ("RGB", "RGBA", "L"), ("L", "1")
+_MEANINGS = {
+    IMAGES: "an 8-bit colour picture",
+    MASKS: "one 8-bit channel, 0 outside and 255 on the person",
+    IGNORED: "one 8-bit channel, 255 where nothing is known of the person",
+}
 _PERSON = 128
 """Masks count as the person from here on, when a whole mask is judged."""
 
@@ -71,21 +77,21 @@ def quick_faults(contents: Contents) -> list[str]:
     """What files' names, picture headers and projected joints show: missing, wrong-sized, behind, outside."""
     faults: list[str] = []
     for camera_name, times in contents.pictures.items():
-        for kind, modes in ((IMAGES, _IMAGE_MODES), (MASKS, _MASK_MODES)):
+        for kind, modes in ((IMAGES, _IMAGE_MODES), (MASKS, _MASK_MODES), (IGNORED, _MASK_MODES)):
             there = contents.files(kind, camera_name)
             missing = [time for time in times if time not in there]
-            if missing:
+            if missing and kind != IGNORED:
                 faults.append(
                     f"{kind}/{camera_name} lacks the pictures of times {spans(missing)}; "
                     f"add them ({file_stem(missing[0])}.png and so on) or take these times out of the splits."
                 )
             if camera_name in contents.cameras:
                 paths = [there[time] for time in times if time in there]
-                faults += _header_faults(contents.folder, paths, contents.cameras[camera_name], modes)
+                faults += _header_faults(contents.folder, paths, contents.cameras[camera_name], modes, _MEANINGS[kind])
     return faults + _placement_faults(contents)
 
 
-def _header_faults(folder: Path, paths: list[Path], camera: Camera, modes: tuple[str, ...]) -> list[str]:
+def _header_faults(folder: Path, paths: list[Path], camera: Camera, modes: tuple[str, ...], meaning: str) -> list[str]:
     def check(path: Path) -> str:
         where = path.relative_to(folder).as_posix()
         try:
@@ -96,8 +102,7 @@ def _header_faults(folder: Path, paths: list[Path], camera: Camera, modes: tuple
         if (height, width) != (camera.height, camera.width):
             return f"{where} has {width} x {height} pixels, its camera {camera.width} x {camera.height}; resize one."
         if mode not in modes:
-            what = "an 8-bit colour picture" if "RGB" in modes else "one 8-bit channel, 0 outside and 255 on the person"
-            return f"{where} should hold {what}; it is of the kind {mode}."
+            return f"{where} should hold {meaning}; it is of the kind {mode}."
         return ""
 
     return _in_threads(check, paths)
@@ -154,6 +159,9 @@ def pixel_faults(contents: Contents) -> list[str]:
         faults += _in_threads(partial(_decoding_fault, contents.folder), [images[t] for t in times if t in images])
         with_joints = [(masks[t], visible.get(t)) for t in times if t in masks]
         faults += _in_threads(partial(_mask_fault, contents.folder, size), with_joints)
+        ignored = contents.files(IGNORED, name)
+        pairs = [(ignored[t], masks[t]) for t in times if t in ignored and t in masks]
+        faults += _in_threads(partial(_ignored_fault, contents.folder), pairs)
     return faults
 
 
@@ -210,6 +218,23 @@ def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, np.ndarra
         low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]])
         if not ((joints >= low) & (joints <= high)).all(-1).any():
             return f"{where} and the posed body do not meet; check that mask, pose and camera are of the same moment."
+    return ""
+
+
+def _ignored_fault(folder: Path, files: tuple[Path, Path]) -> str:
+    """What is wrong with one layer of ignored pixels, given its file and the mask's."""
+    ignored_file, mask_file = files
+    damaged = _decoding_fault(folder, ignored_file)
+    if damaged:
+        return damaged
+    try:
+        with Image.open(ignored_file) as layer, Image.open(mask_file) as picture:
+            ignored, person = (np.array(p.convert("L")) >= _PERSON for p in (layer, picture))
+    except (OSError, ValueError, SyntaxError):
+        return ""  # other checks name it
+    if ignored.shape == person.shape and person.any() and not (person & ~ignored).any():
+        where = ignored_file.relative_to(folder).as_posix()
+        return f"{where} ignores all of the person; take this time out of the splits."
     return ""
 
 

@@ -9,7 +9,7 @@ import math
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from twofold.errors import TwofoldError
 
@@ -26,6 +26,11 @@ PROTOCOLS = {
     "silhouette_iou": "intersection over union of opacity > 0.5 and the true mask > 0.5",
 }
 """What each number of `compare` is, in one line."""
+IGNORED_PROTOCOL = (
+    "{share:.1f} % of the box on average, hidden by something in front, are left out: PSNR and overlap are over the "
+    "other pixels, SSIM over the windows that touch none of them"
+)
+"""A further line where pixels were ignored."""
 
 
 def to_8bit(image: Float[Tensor, "*b"]) -> UInt8[Tensor, "*b"]:
@@ -51,16 +56,22 @@ def psnr(
     return min(-10 * math.log10(error), PSNR_CEILING) if error > 0 else PSNR_CEILING
 
 
-def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], data_range: float = 1.0) -> float:
+def ssim(
+    image: Float[Tensor, "h w 3"],
+    truth: Float[Tensor, "h w 3"],
+    data_range: float = 1.0,
+    ignored: Bool[Tensor, "h w"] | None = None,
+) -> float:
     """Structural similarity, as scikit-image defines it: uniform window, unbiased covariances, mean of the channels.
 
     Args:
         image: the picture.
         truth: what it should be.
         data_range: 1 for colours in 0..1; 2 repeats what programs of the field got for floats without naming a range.
+        ignored: pixels that count nowhere: the mean is over the windows that touch none of them.
 
     Raises:
-        TwofoldError: a side is shorter than the window.
+        TwofoldError: a side is shorter than the window, or every window touches an ignored pixel.
     """
     if min(image.shape[:2]) < SSIM_WINDOW:
         size = "x".join(str(n) for n in image.shape[:2])
@@ -79,6 +90,11 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], data_rang
     similarity = ((2 * mean_x * mean_y + c1) * (2 * covariance + c2)) / (
         (mean_x.square() + mean_y.square() + c1) * (variance_x + variance_y + c2)
     )
+    if ignored is not None:
+        touched = max_pool2d(ignored[None].double(), SSIM_WINDOW, stride=1)[0] > 0
+        similarity = similarity[:, ~touched]
+        if not similarity.numel():
+            raise TwofoldError("Every window of SSIM touches ignored pixels; leave this frame out.")
     return similarity.mean().item()
 
 
@@ -100,24 +116,39 @@ def subject_box(mask: Float[Tensor, "h w"], margin: int = 0) -> tuple[slice, sli
 
 
 def psnr_box(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"], margin: int = 0
+    image: Float[Tensor, "h w 3"],
+    truth: Float[Tensor, "h w 3"],
+    mask: Float[Tensor, "h w"],
+    margin: int = 0,
+    ignored: Bool[Tensor, "h w"] | None = None,
 ) -> float:
-    """PSNR in dB over the subject's box, which a large background cannot flatter."""
+    """PSNR in dB over the subject's box, which a large background cannot flatter, without `ignored` pixels."""
     box = subject_box(mask, margin)
-    return psnr(image[box], truth[box])
+    return psnr(image[box], truth[box], None if ignored is None else ~ignored[box])
 
 
 def ssim_box(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"], margin: int = 0
+    image: Float[Tensor, "h w 3"],
+    truth: Float[Tensor, "h w 3"],
+    mask: Float[Tensor, "h w"],
+    margin: int = 0,
+    ignored: Bool[Tensor, "h w"] | None = None,
 ) -> float:
-    """SSIM over the subject's box."""
+    """SSIM over the subject's box, without windows that touch `ignored` pixels."""
     box = subject_box(mask, margin)
-    return ssim(image[box], truth[box])
+    return ssim(image[box], truth[box], ignored=None if ignored is None else ignored[box])
 
 
-def silhouette_iou(opacity: Float[Tensor, "h w"], mask: Float[Tensor, "h w"], threshold: float = 0.5) -> float:
-    """Intersection over union of two silhouettes; 1 where both are empty."""
+def silhouette_iou(
+    opacity: Float[Tensor, "h w"],
+    mask: Float[Tensor, "h w"],
+    threshold: float = 0.5,
+    ignored: Bool[Tensor, "h w"] | None = None,
+) -> float:
+    """Intersection over union of two silhouettes, without `ignored` pixels; 1 where both are empty."""
     ours, theirs = opacity > threshold, mask > threshold
+    if ignored is not None:
+        ours, theirs = ours & ~ignored, theirs & ~ignored
     union = (ours | theirs).sum().item()
     return (ours & theirs).sum().item() / union if union else 1.0
 
@@ -127,15 +158,18 @@ def compare(
     truth: Float[Tensor, "h w 3"],
     opacity: Float[Tensor, "h w"],
     mask: Float[Tensor, "h w"],
+    ignored: Bool[Tensor, "h w"] | None = None,
 ) -> dict[str, float]:
-    """All figures of one picture, named as in `PROTOCOLS`."""
+    """All figures of one picture, named as in `PROTOCOLS`; pixels that are `ignored` count in none of them."""
+    if ignored is not None and not ignored.any():
+        ignored = None
     return {
-        "psnr": psnr(image, truth),
-        "psnr_box": psnr_box(image, truth, mask),
-        "ssim": ssim(image, truth),
-        "ssim_box": ssim_box(image, truth, mask),
-        "ssim_range_2": ssim(image, truth, data_range=2.0),
-        "silhouette_iou": silhouette_iou(opacity, mask),
+        "psnr": psnr(image, truth, None if ignored is None else ~ignored),
+        "psnr_box": psnr_box(image, truth, mask, ignored=ignored),
+        "ssim": ssim(image, truth, ignored=ignored),
+        "ssim_box": ssim_box(image, truth, mask, ignored=ignored),
+        "ssim_range_2": ssim(image, truth, 2.0, ignored),
+        "silhouette_iou": silhouette_iou(opacity, mask, ignored=ignored),
     }
 
 
