@@ -60,10 +60,17 @@ def beside_truth(
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Picture]:
     """A frame's own picture on the background, and the avatar's."""
     background = _background(capture)
-    mask = frame.mask()[..., None]
     posed = avatar.pose(frame.pose, frame.translation)
     picture = draw(avatar, posed, frame.camera, background, chunk)
-    return as_bytes(frame.image() * mask + background * (1 - mask)), picture
+    return as_bytes(shown_truth(frame, background)), picture
+
+
+def shown_truth(frame: Frame, background: Float[Tensor, "3"]) -> Float[Tensor, "h w 3"]:
+    """A frame's own picture on the background; what is ignored there is hatched in grey."""
+    mask, ignored = frame.mask()[..., None], frame.ignored()
+    rows, columns = (torch.arange(size) for size in ignored.shape)
+    hatch = torch.where((rows[:, None] + columns) % 6 < 2, 0.75, 0.5)[..., None]
+    return torch.where(ignored[..., None], hatch, frame.image() * mask + background * (1 - mask))
 
 
 def comparison(

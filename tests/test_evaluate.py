@@ -1,0 +1,48 @@
+"""What is measured, and what the file says about it."""
+
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import torch
+from little_body import little_body
+from PIL import Image
+
+from twofold import evaluate
+from twofold.capture.types import Capture, Frame
+from twofold.geometry.cameras import Camera
+from twofold.methods.base import Avatar
+from twofold.outputs.views import Picture
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Two pictures of a red rectangle 20 x 12; a sixth of the first one's is ignored."""
+    image, mask, layer = (np.zeros(shape, np.uint8) for shape in ((40, 32, 3), (40, 32), (40, 32)))
+    image[10:30, 8:20], mask[10:30, 8:20], layer[10:14, 8:18] = (255, 0, 0), 255, 255
+    for name, pixels in (("image", image), ("mask", mask), ("ignored", layer)):
+        Image.fromarray(pixels).save(tmp_path / f"{name}.png")
+    camera = Camera(torch.eye(4), torch.eye(3), 40, 32)
+    pose, translation = torch.zeros(24, 3), torch.zeros(3)
+    frame = Frame(0, "cam", camera, pose, translation, tmp_path / "image.png", tmp_path / "mask.png")
+    hidden = replace(frame, time=1, ignored_file=tmp_path / "ignored.png")
+    splits = {"train": (frame,), "novel_view": (), "novel_pose": (hidden, replace(frame, time=2))}
+    return Capture("rectangle", tmp_path, little_body(), torch.zeros(0), 10.0, (0.0, 0.0, 0.0), splits)
+
+
+def test_what_is_ignored_spoils_no_figure_and_its_share_is_told(capture, monkeypatch):
+    def drawn(avatar, capture, frame, refined):
+        """The truth, but for what is ignored."""
+        image, mask = evaluate.truth(frame, capture.background)
+        ignored = frame.ignored()
+        color, opacity = torch.where(ignored[..., None], 0.3, image), torch.where(ignored, 0.0, mask)
+        return Picture(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
+
+    monkeypatch.setattr(evaluate, "draw_frame", drawn)
+    avatar = Mock(spec=Avatar)
+    figures = evaluate.measure_split(avatar, capture, "novel_pose")
+    assert (figures["psnr"], figures["silhouette_iou"]) == (100, 1)
+    assert figures["ssim_box"] == pytest.approx(1)
+    assert figures["protocol"]["ignored"].startswith("8.3 % of the box on average")
+    assert "ignored" not in evaluate.measure_split(avatar, capture, "train")["protocol"]
