@@ -1,6 +1,7 @@
 """Surfaces of shapes whose form is known, and their posing by a body whose motion is known."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -58,16 +59,14 @@ def test_field_is_asked_only_near_the_body_and_in_chunks() -> None:
     assert enclosed_volume(vertices, faces) == pytest.approx(4 / 3 * math.pi * 0.2**3, rel=0.01)
 
 
-@pytest.mark.parametrize("slope", [0.3, 1.0, 1.4])
+@pytest.mark.parametrize("slope", [0.3, 1.4])
 def test_thin_things_between_points_of_the_coarse_grid_are_found(slope: float) -> None:
-    """A sphere of one and a half voxels, touching no coarse point, wherever it lies and however steep the field."""
+    """Spheres of less than two voxels, wherever they lie and however steep the field."""
     generator = torch.Generator().manual_seed(0)
-    for _ in range(20):
+    for _ in range(10):
         center = CENTER + 0.1 * torch.rand(3, generator=generator)
-        near = torch.cat([center[None] + 0.01, on_sphere(0.03, 40)])
-        vertices, _ = extract_surface(
-            lambda x, center=center: slope * sphere(x, 0.015, center), near, voxel=0.01, radius=0.06
-        )
+        level = partial(sphere, radius=0.009, center=center)
+        vertices, _ = extract_surface(lambda x, f=level: slope * f(x), center[None] + 0.01, voxel=0.01, radius=0.04)
         assert torch.allclose(vertices.mean(0), center, atol=3e-3)
 
 

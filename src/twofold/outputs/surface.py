@@ -60,9 +60,9 @@ def extract_surface(
 
     ask(2 * _points_near(near, low, blocks, 2 * voxel, radius + half_diagonal).nonzero())
     corners = torch.stack([_shifted(volume[::2, ::2, ::2], corner) for corner in CORNERS])
-    # The nearest corner of a cell is at most half its diagonal away from a surface that passes through it.
-    close = corners.abs().amin(0) < 1.5 * half_diagonal
-    active = (close | (corners.amin(0) * corners.amax(0) <= 0)) & ~corners.isnan().any(0)
+    # The nearest corner of a cell is at most half its diagonal away from a surface that passes through it; corners that
+    # were not asked are NaN, and comparing with them gives false.
+    active = (corners.abs().amin(0) < 1.5 * half_diagonal) | (corners.amin(0) * corners.amax(0) <= 0)
     fine = active.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
     wanted = torch.zeros(volume.shape, dtype=torch.bool)
     for corner in CORNERS:
