@@ -155,10 +155,10 @@ def test_a_folder_that_is_no_run_is_named_so(tmp_path):
 
 
 def test_checkpoint_of_another_recipe_is_named_by_its_first_tensor(run):
+    recipe = json.loads((run / "recipe.json").read_text())
+    recipe["method"]["field"]["width"] = 24
+    (run / "recipe.json").write_text(json.dumps(recipe))
     with pytest.raises(TwofoldError, match="does not fit its recipe") as error:
-        recipe = json.loads((run / "recipe.json").read_text())
-        recipe["method"]["field"]["width"] = 24
-        (run / "recipe.json").write_text(json.dumps(recipe))
         load(run)
     assert "first at field." in sentence(error)
 
