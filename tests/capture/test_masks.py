@@ -159,7 +159,7 @@ def test_what_sticks_out_is_an_object_only_in_other_colours_than_the_body_beside
     assert not hidden.any()
 
 
-def test_more_than_a_fifth_of_the_mask_is_a_bad_fit() -> None:
+def test_more_than_a_quarter_of_the_mask_is_a_bad_fit() -> None:
     image, seen, usual = _striped()
     image[100:170, 80:110] = BALL
     cleaned, hidden, share = _hidden(image, _person(), seen, usual)

@@ -221,7 +221,7 @@ def without_objects(
     usual: Float[np.ndarray, "V 3"],
     trusted: Bool[np.ndarray, "V"],
     difference: float = 0.25,
-    most: float = 0.2,
+    most: float = 0.25,
 ) -> tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"], float]:
     """A mask without what sticks out of the body, the pixels that objects hide, and their share of the mask.
 
