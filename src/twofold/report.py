@@ -343,7 +343,7 @@ font-variant-numeric:tabular-nums}
 .charts,.videos{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,420px),1fr));gap:22px;margin:16px 0}
 .videos{grid-template-columns:repeat(auto-fill,minmax(min(100%,300px),1fr))}
 .charts figure{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:14px 16px 8px;
-max-width:640px}
+max-width:549px}
 .charts figcaption{margin:0 0 6px;display:flex;gap:4px 16px;flex-wrap:wrap}
 .charts b{color:var(--ink);font-weight:600;margin-right:auto}
 .charts span::before{content:"";display:inline-block;width:12px;height:3px;border-radius:2px;background:var(--c);
