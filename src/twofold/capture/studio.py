@@ -293,8 +293,12 @@ def _film(
             progress(done / config.frames)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for finished in [pool.submit(film, time) for time in range(config.frames)]:
-            finished.result()
+        try:
+            for finished in [pool.submit(film, time) for time in range(config.frames)]:
+                finished.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def _hands(performer: Performer, time: int) -> Float[np.ndarray, "2 3"]:

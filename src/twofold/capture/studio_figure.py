@@ -63,7 +63,7 @@ def build_figure(shaped: ShapedBody, look: Look) -> Figure:
     anatomy = survey(shaped)
     tree = KDTree(anatomy.points)
     low = anatomy.points.min(0) - 0.09
-    shape = tuple(np.ceil((np.ptp(anatomy.points, axis=0) + 0.18) / COARSE).astype(int) + 1)
+    shape = tuple(int(n) + 1 for n in np.ceil((np.ptp(anatomy.points, axis=0) + 0.18) / COARSE))
     nodes = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 3)
     nodes = (low + nodes * COARSE).astype(np.float32)
     exact, shift = _rough_distance(low, shape, anatomy, tree)
@@ -192,6 +192,6 @@ def _skinning_weights(
     hair = layer == HAIR
     weights[hair] = 0
     weights[hair, 15] = 1
-    fourth = np.partition(weights, -4, axis=1)[:, -4][:, None]
-    weights = np.where((weights >= fourth) & (weights > 1e-4), weights, 0)
+    np.put_along_axis(weights, np.argpartition(weights, -4, axis=1)[:, :-4], 0, axis=1)
+    weights[weights < 1e-4] = 0
     return sparse.csr_matrix((weights / weights.sum(1, keepdims=True)).astype(np.float32))

@@ -76,18 +76,27 @@ def cast_shade(
     v, n = torch.from_numpy(vertices[beads.chosen]), torch.from_numpy(normals[beads.chosen])
     key = torch.zeros(len(v))
     for direction in torch.from_numpy(key_directions):
-        key += _lit(v, direction) / len(key_directions)
+        key += _lit(v, n @ direction, direction) / len(key_directions)
     weighted, total = torch.zeros(len(v)), torch.full((len(v),), 1e-3)
     for direction in torch.from_numpy(sky_directions):
         facing = (n @ direction).clamp_min(0) * (0.75 + 0.25 * direction[1])
-        weighted += facing * _lit(v, direction)
+        weighted += facing * _lit(v, n @ direction, direction)
         total += facing
     both = beads.spread @ torch.stack([key, weighted / total], -1).numpy()
     return both[:, 0], both[:, 1]
 
 
-def _lit(vertices: Float[torch.Tensor, "b 3"], direction: Float[torch.Tensor, "3"]) -> Float[torch.Tensor, "b"]:
-    """Share of the light from one direction that arrives, softened over neighbouring cells."""
+def _lit(
+    vertices: Float[torch.Tensor, "b 3"], facing: Float[torch.Tensor, "b"], direction: Float[torch.Tensor, "3"]
+) -> Float[torch.Tensor, "b"]:
+    """Share of the light from one direction that arrives, softened over neighbouring cells.
+
+    Args:
+        vertices: world, metres.
+        facing: cosine between their normals and the direction; seen at a slant, a surface spans more depth in a cell.
+        direction: towards the light.
+    """
+    slack = _BIAS * (0.5 + 0.5 / facing.abs().clamp_min(0.15))
     helper = torch.tensor([0.0, 0.0, 1.0]) if abs(float(direction[1])) > 0.9 else torch.tensor([0.0, 1.0, 0.0])
     right = torch.linalg.cross(helper, direction)
     right = right / right.norm()
@@ -104,7 +113,7 @@ def _lit(vertices: Float[torch.Tensor, "b 3"], direction: Float[torch.Tensor, "3
     for i, wx in ((0, 1 - px), (1, px)):
         for j, wy in ((0, 1 - py), (1, py)):
             gap = depth - front[corner + (i * stride + j)]
-            lit += wx * wy * (1 - (gap - _BIAS) * 80).clamp(0, 1)
+            lit += wx * wy * (1 - (gap - slack) * 80).clamp(0, 1)
     return lit
 
 
@@ -130,7 +139,7 @@ def illuminate(
     ambient = (GROUND + up * (SKY - GROUND)) * (0.25 + 0.75 * sky)[:, None]
     light = 1.05 * from_key[:, None] * KEY_COLOR + from_rim[:, None] * RIM_COLOR + ambient
     half = to_camera + KEY
-    half = half / np.linalg.norm(half, axis=1, keepdims=True)
+    half = half / np.linalg.norm(half, axis=1, keepdims=True).clip(1e-6)
     shine = np.clip((normals * half).sum(1), 0, None) ** 24 * key * paint.gloss
     return to_srgb(0.95 * paint.color * light + shine[:, None] * KEY_COLOR)
 

@@ -13,20 +13,20 @@ from scipy.spatial.transform import Rotation
 class Arm:
     """Degrees: `raise_` from hanging (0) to upright (180), `forward` from sideways (0) to ahead (90)."""
 
-    raise_: float = 14
-    forward: float = 20
-    twist: float = 0
-    elbow: float = 18
+    raise_: int = 14
+    forward: int = 20
+    twist: int = 0
+    elbow: int = 18
 
 
 @dataclass(frozen=True)
 class Leg:
     """Degrees. `lift` swings the thigh ahead, `out` sideways, `turn` points the foot outward, `knee` bends."""
 
-    lift: float = 0
-    out: float = 2
-    turn: float = 8
-    knee: float = 4
+    lift: int = 0
+    out: int = 2
+    turn: int = 8
+    knee: int = 4
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class Stance:
     right_arm: Arm = Arm()
     left_leg: Leg = Leg()
     right_leg: Leg = Leg()
-    bow: float = 0
-    lean: float = 0
-    wind: float = 0
-    nod: float = 0
-    look: float = 0
+    bow: int = 0
+    lean: int = 0
+    wind: int = 0
+    nod: int = 0
+    look: int = 0
 
-    def numbers(self) -> list[float]:
+    def numbers(self) -> list[int]:
         """All angles in a row: four for each limb, then the trunk's three and the head's two."""
         limbs = [self.left_arm, self.right_arm]
         arms = [n for a in limbs for n in (a.raise_, a.forward, a.twist, a.elbow)]
@@ -94,30 +94,27 @@ def choreograph(
         Axis-angle poses (radians, SMPL's T-pose is zero) and offsets (metres).
     """
     random = np.random.default_rng([seed, 2])
-    first, yaw = _blend(REHEARSED, rehearsed, max(4, min(11, rehearsed // 3)), random)
+    standing, *others = REHEARSED
+    first = [standing, *(others[i] for i in random.permutation(len(others)))][: max(4, rehearsed // 3)]
+    second = [UNREHEARSED[i] for i in random.permutation(len(UNREHEARSED))][: max(3, unrehearsed // 2)]
     start = random.uniform(-20, 20)
-    turn = np.stack([start + 720 * yaw * (rehearsed - 1) / max(rehearsed, 1)])[0]
-    second, more = _blend(UNREHEARSED, unrehearsed, max(3, min(6, unrehearsed // 2)), random)
-    turn = np.concatenate([turn, start + 200 + 300 * more])
-    angles = np.concatenate([first, second])
+    angles = np.concatenate([_blend(first, rehearsed, random), _blend(second, unrehearsed, random)])
+    turn = np.concatenate(
+        [start + 720 * np.arange(rehearsed) / rehearsed, start + 200 + 300 * np.arange(unrehearsed) / unrehearsed]
+    )
     time = np.arange(len(angles)) / 12
     sway = np.stack([0.03 * np.sin(time * 1.7 + seed), 0.025 * np.sin(time * 1.3 + 1 + seed)], -1)
     return _poses(angles, turn), sway
 
 
-def _blend(
-    stances: tuple[Stance, ...], moments: int, visits: int, random: np.random.Generator
-) -> tuple[Float[np.ndarray, "T 21"], Float[np.ndarray, "T"]]:
-    """A smooth path through some of the stances, each a little different every time, and even time in 0..1."""
-    order = [0, *(1 + random.permutation(len(stances) - 1))][:visits] if stances is REHEARSED else None
-    order = random.permutation(len(stances))[:visits] if order is None else order
-    keys = np.array([stances[i].numbers() for i in order])
+def _blend(stances: list[Stance], moments: int, random: np.random.Generator) -> Float[np.ndarray, "T 21"]:
+    """A smooth path through stances, each a little different every time; degrees."""
+    keys = np.array([stance.numbers() for stance in stances])
     keys = keys + random.normal(size=keys.shape) * np.repeat([5.0, 2.5], [8, 13])
     keys[:, [3, 7, 11, 15]] = keys[:, [3, 7, 11, 15]].clip(3, 120)
     keys[:, [0, 4]] = keys[:, [0, 4]].clip(13, 128)
-    time = np.linspace(0, 1, moments) if moments > 1 else np.zeros(moments)
-    path = PchipInterpolator(np.linspace(0, 1, len(keys)), keys)(time)
-    return gaussian_filter1d(path, 0.12 * moments / len(keys), axis=0, mode="nearest"), time
+    path = PchipInterpolator(np.linspace(0, 1, len(keys)), keys)(np.linspace(0, 1, moments))
+    return gaussian_filter1d(path, 0.12 * moments / len(keys), axis=0, mode="nearest")
 
 
 def _poses(angles: Float[np.ndarray, "T 21"], yaw: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T 24 3"]:

@@ -138,19 +138,18 @@ def split_edges(
     return vertices[parents.to(vertices.device)].mean(1), new_faces.to(faces.device), parents.to(faces.device)
 
 
-def _split_triangles(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Triangles after their edges got middle vertices (-1: none); edge i runs from corner i to corner i + 1."""
-    has = middle >= 0
-    count = has.sum(1)
+def _split_triangles(faces: Int[np.ndarray, "F 3"], middle: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
+    """Triangles after their edges got middle vertices (-1: none); edge i runs from corner i to corner i + 1.
+
+    Edges are halved between marked corners, so of a triangle's three none, one or all are; never two.
+    """
+    count = (middle >= 0).sum(1)
     pieces = [faces[count == 0]]
     for edge in range(3):
-        a, b, c = (faces[:, (edge + i) % 3] for i in range(3))
-        m, n = middle[:, edge], middle[:, (edge + 1) % 3]
-        one = (count == 1) & has[:, edge]
-        pieces += [np.stack([a, m, c], -1)[one], np.stack([m, b, c], -1)[one]]
-        two = (count == 2) & has[:, edge] & has[:, (edge + 1) % 3]
-        pieces += [np.stack([m, b, n], -1)[two], np.stack([a, m, n], -1)[two], np.stack([a, n, c], -1)[two]]
-    all_three = count == 3
-    (a, b, c), (m, n, o) = faces[all_three].T, middle[all_three].T
+        one = (count == 1) & (middle[:, edge] >= 0)
+        a, b, c = (faces[one, (edge + i) % 3] for i in range(3))
+        m = middle[one, edge]
+        pieces += [np.stack([a, m, c], -1), np.stack([m, b, c], -1)]
+    (a, b, c), (m, n, o) = faces[count == 3].T, middle[count == 3].T
     pieces += [np.stack(t, -1) for t in ((a, m, o), (m, b, n), (o, n, c), (m, n, o))]
     return np.concatenate(pieces)
