@@ -85,7 +85,7 @@ class PoseConfig:
     zero_until: int = 10_000
     """The branch sees a zero pose before this step."""
     zero_every: int = 50
-    """Afterwards it sees a zero pose during every epoch whose number is a multiple of this; 0 for never."""
+    """Afterwards it sees a zero pose during every epoch (a step a moment) whose number this divides; 0 for never."""
     drop: float = 0.0
     """Chance of a zero pose at any training step (ours; the schedule above is the release's)."""
     refine: tuple[Literal["root", "body", "translation", "shape"], ...] = ("root", "body", "translation", "shape")
@@ -319,13 +319,13 @@ class FactorizedAvatar(Avatar):
         low, high = posed.body.joints.detach().amin(0) - margin, posed.body.joints.detach().amax(0) + margin
         clipped, hit = clip_to_box(rays, low, high)
         inside = hit.nonzero()[:, 0]
-        tree = KDTree(posed.body.vertices.detach().cpu().numpy())
+        k, tree = self.config.neighbours, KDTree(posed.body.vertices.detach().cpu().numpy())
         limit = self.config.outlier_distance / self.scale
 
         def neighbours(points: Tensor) -> tuple[Tensor, Tensor]:
-            distance, index = tree.query(points.detach().cpu().numpy(), k=self.config.neighbours, workers=-1)
-            found = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), -1))
-            apart = torch.from_numpy(np.asarray(distance, dtype=np.float32).reshape(len(points), -1))
+            distance, index = tree.query(points.detach().cpu().numpy(), k=k, workers=-1)
+            found = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), k))
+            apart = torch.from_numpy(np.asarray(distance, dtype=np.float32).reshape(len(points), k))
             return found.to(points.device), apart.to(points.device)
 
         def sdf(points: Tensor) -> Tensor:
