@@ -89,9 +89,7 @@ def project(camera: Camera, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor
     return homogeneous[..., :2] / homogeneous[..., 2:], in_camera[..., 2]
 
 
-def clip_to_box(
-    rays: Rays, low: Float[Tensor, "3"], high: Float[Tensor, "3"]
-) -> tuple[Rays, Bool[Tensor, "*b"]]:
+def clip_to_box(rays: Rays, low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> tuple[Rays, Bool[Tensor, "*b"]]:
     """Rays with near and far where they enter and leave an axis-aligned box, and which of them meet it at all."""
     # A direction component of exactly zero would divide 0 by 0 on a face of the box.
     safe = torch.where(rays.directions.abs() < 1e-9, torch.full_like(rays.directions, 1e-9), rays.directions)
