@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from twofold.errors import TwofoldError
-from twofold.geometry.surfaces import closest_on_triangles, sample_surface
+from twofold.geometry.surfaces import closest_on_triangles, face_normals, sample_surface
 from twofold.metrics.shape import (
     PROTOCOLS,
     chamfer_cm,
@@ -122,18 +122,24 @@ def test_same_seed_same_figure_and_another_seed_nearly() -> None:
     assert other == pytest.approx(first, rel=0.1)
 
 
-def test_distances_are_those_of_an_exhaustive_search() -> None:
+def test_figures_are_those_of_an_exhaustive_search() -> None:
     """Large triangles beside small ones, points far and near: all triangles, one by one."""
-    coarse, fine = plane(3), sphere(0.1, 40)
+
+    def exhaustive(source: Mesh, target: Mesh) -> tuple[float, float]:
+        points, normals = sample_surface(*source, 150, torch.Generator().manual_seed(0))
+        a, b, c = (target[0][target[1][:, i]].expand(150, -1, -1) for i in range(3))
+        away = (closest_on_triangles(points[:, None].expand_as(a), a, b, c) - points[:, None]).norm(dim=-1)
+        cosines = (normals * face_normals(*target)[away.argmin(1)]).sum(-1).abs()
+        return 100 * away.amin(1).mean().item(), cosines.mean().item()
+
+    coarse, fine, other = plane(3), sphere(0.1, 24), sphere(0.3, 25)
     vertices = torch.cat([coarse[0], fine[0] + torch.tensor([0.5, 0.5, 0.12])])
-    faces = torch.cat([coarse[1], fine[1] + len(coarse[0])])
-    other = sphere(0.3, 25)
-    points, _ = sample_surface(*other, 150, torch.Generator().manual_seed(0))
-    a, b, c = (vertices[faces[:, i]].expand(len(points), -1, -1) for i in range(3))
-    feet = closest_on_triangles(points[:, None].expand_as(a), a, b, c)
-    exhaustive = (feet - points[:, None]).norm(dim=-1).amin(1).mean().item()
-    figures = compare_surfaces(*other, vertices, faces, samples=150)
-    assert figures["accuracy_cm"] == pytest.approx(100 * exhaustive, rel=1e-4)
+    mixed = vertices, torch.cat([coarse[1], fine[1] + len(coarse[0])])
+    (accuracy, cosine), (completeness, cosine_back) = exhaustive(other, mixed), exhaustive(mixed, other)
+    figures = compare_surfaces(*other, *mixed, samples=150)
+    assert figures["accuracy_cm"] == pytest.approx(accuracy, rel=1e-4)
+    assert figures["completeness_cm"] == pytest.approx(completeness, rel=1e-4)
+    assert figures["normal_consistency"] == pytest.approx((cosine + cosine_back) / 2, abs=1e-3)
 
 
 def test_empty_or_broken_surface_is_one_clear_sentence() -> None:
