@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+from time import sleep
 
 import numpy as np
 import pytest
@@ -212,6 +213,7 @@ def test_a_fault_while_filming_ends_the_work_and_leaves_nothing(performer, monke
 
     def refuse(*_):
         calls.append(1)
+        sleep(0.02)  # as filming takes its time, too
         raise OSError("no light")
 
     monkeypatch.setattr(studio, "perform", refuse)

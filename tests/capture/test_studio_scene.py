@@ -74,15 +74,20 @@ def test_at_times_a_hand_is_missing():
     assert 5 < sum(missing) < 30
 
 
-def test_more_noise_is_worse():
-    def overlap(strength):
-        values = []
-        for seed in range(12):
-            a, b = (
-                disc() > 0,
-                spoil_mask(disc(), np.zeros((0, 2), np.float32), strength, np.random.default_rng(seed)) > 0,
-            )
-            values.append((a & b).sum() / (a | b).sum())
-        return np.mean(values)
+def overlap(strength, size=96, radius=30):
+    """Mean intersection over union of a disc and the same spoiled."""
+    mask, values = disc(size, radius), []
+    for seed in range(12):
+        spoiled = spoil_mask(mask, np.zeros((0, 2), np.float32), strength, np.random.default_rng(seed))
+        a, b = mask > 0, spoiled > 0
+        values.append((a & b).sum() / (a | b).sum())
+    return np.mean(values)
 
+
+def test_more_noise_is_worse():
     assert 0.8 < overlap(1.0) < overlap(0.3) < 1
+
+
+def test_small_pictures_are_spoiled_as_much_as_large_ones():
+    lost = [1 - overlap(1.0, size, size // 10) for size in (64, 128, 256)]
+    assert max(lost) < 1.5 * min(lost)

@@ -92,9 +92,10 @@ def spoil_mask(
         return mask
     size = mask.shape[0]
     within, without = (np.asarray(ndimage.distance_transform_edt(m)) for m in (mask >= 0.5, mask < 0.5))
-    inside = within - without
+    # The edge runs between two pixels' centres, half a pixel from each.
+    inside = np.where(mask >= 0.5, within - 0.5, 0.5 - without)
     waves = ndimage.gaussian_filter(random.normal(size=mask.shape), max(size * 0.012, 0.8))
-    inside = inside + 0.012 * size * strength * waves / max(waves.std(), 1e-6)
+    inside = inside + 0.006 * size * strength * waves / max(waves.std(), 1e-6)
     rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
     for column, row in hands:
         if random.random() < 0.25 * strength:

@@ -1,0 +1,257 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from small_recipes import CASES, LATE
+
+from twofold.capture.pixels import PixelSource
+from twofold.geometry.cameras import pixel_grid, pixel_rays
+from twofold.methods.base import Subject
+from twofold.methods.factorized import PoseConfig, ShellSampler
+from twofold.metrics.perceptual import LPIPS
+from twofold.outputs.views import draw
+from twofold.train.run import load
+from twofold.volume.rendering import laplace_density
+from twofold.volume.samplers import ErrorBoundedSampler
+
+QUICK, RELEASED = CASES["quick"].method, CASES["released"].method
+BLACK = torch.zeros(3)
+
+
+@pytest.fixture(scope="module")
+def subject(person):
+    return Subject.of(person)
+
+
+def pose_of(avatar, person, which=1, **options):
+    frame = person.train[which]
+    return avatar.pose(frame.pose, frame.translation, **options)
+
+
+def rays_of(person, size=10):
+    camera = person.train[1].camera.resized(size, size)
+    return pixel_rays(camera, pixel_grid(camera).flatten(0, 1))
+
+
+@pytest.mark.parametrize("form", ["softplus", "absolute"])
+@pytest.mark.parametrize("beta", [0.002, 0.01, 0.1, 1.0])
+def test_density_scale_starts_as_configured(subject, form, beta):
+    avatar = replace(QUICK, beta=beta, beta_floor=1e-4, beta_form=form).build(subject)
+    assert float(avatar.beta.detach()) == pytest.approx(beta, rel=1e-5)
+
+
+@pytest.mark.parametrize("form", ["softplus", "absolute"])
+def test_density_scale_never_falls_below_its_floor(subject, form):
+    avatar = replace(QUICK, beta=0.01, beta_floor=1e-3, beta_form=form).build(subject)
+    for raw in (-10.0, -0.1, 0.0, 0.1):
+        with torch.no_grad():
+            avatar.raw_beta.fill_(raw)
+        assert float(avatar.beta.detach()) >= 0.999e-3
+
+
+@pytest.fixture(scope="module")
+def telling(subject, person):
+    """A function that gives what the networks are told of a pose at a step."""
+    avatar = QUICK.build(subject)
+
+    def told(step, **options):
+        pose = PoseConfig(**({"zero_until": 0, "zero_every": 0} | options))
+        avatar.config = replace(avatar.config, pose=pose)
+        return avatar._condition(person.train[1].pose, step)
+
+    return told
+
+
+def test_pose_is_told_without_the_root_over_pi_or_as_it_is(telling, person):
+    angles = person.train[1].pose
+    torch.testing.assert_close(telling(None), angles[1:].flatten() / math.pi)
+    torch.testing.assert_close(telling(7, divide_by_pi=False, with_root=True), angles.flatten())
+
+
+def test_pose_is_kept_back_at_first_and_every_so_many_epochs_but_never_when_looking(telling):
+    options = {"zero_until": 10, "zero_every": 3}  # an epoch has five steps here
+    shown = [bool(telling(step, **options).any()) for step in range(35)]
+    assert shown == [step >= 10 and step // 5 % 3 != 0 for step in range(35)]
+    assert telling(None, **options).any()
+
+
+def test_pose_is_dropped_by_chance_as_often_as_asked_and_the_same_each_time(telling):
+    kept = [bool(telling(step, drop=0.2).any()) for step in range(1000)]
+    assert 0.16 < 1 - sum(kept) / 1000 < 0.24
+    assert kept == [bool(telling(step, drop=0.2).any()) for step in range(1000)]
+
+
+def test_poses_are_corrected_from_the_given_step_on_and_only_in_training_moments(subject, person):
+    avatar = replace(QUICK, pose=replace(QUICK.pose, refine_from=5)).build(subject)
+    with torch.no_grad():
+        avatar.refinement.translation[1] = torch.tensor([0.1, 0.0, 0.0])
+    plain, time = pose_of(avatar, person), person.train[1].time
+    moved = pose_of(avatar, person, time=time, step=5)
+    torch.testing.assert_close(moved.body.joints - plain.body.joints, torch.tensor([0.1, 0, 0]).expand(24, 3))
+    assert moved.forward.requires_grad
+    assert not pose_of(avatar, person, time=time, step=4).forward.requires_grad
+    assert torch.equal(pose_of(avatar, person, time=1234).body.joints, plain.body.joints)
+
+
+@pytest.mark.parametrize("parts", [(), ("root",), ("body", "shape"), ("root", "body", "translation", "shape")])
+def test_only_the_parts_to_be_refined_learn(subject, person, parts):
+    avatar = replace(QUICK, pose=replace(QUICK.pose, refine=parts)).build(subject)
+    group = avatar.parameter_groups()["pose"]
+    assert {id(p) for p in group} == {id(getattr(avatar.refinement, part)) for part in parts}
+    posed = pose_of(avatar, person, time=1, step=LATE)
+    assert posed.forward.requires_grad == bool(parts)
+
+
+def test_shells_follow_corrections_only_at_a_refresh_and_then_with_the_shape(subject, person):
+    avatar = replace(QUICK, shell_refresh=10).build(subject)
+    time = person.train[1].time
+    before = pose_of(avatar, person, time=time, step=8).shell
+    with torch.no_grad():
+        avatar.refinement.translation += 0.2
+        avatar.refinement.shape += 1.0
+    avatar.before_step(9)
+    assert pose_of(avatar, person, time=time, step=9).shell is before
+    # A resumed run builds the shell anew from what is stored, and must get the same one.
+    resumed = replace(QUICK, shell_refresh=10).build(subject, 1)
+    resumed.load_state_dict(avatar.state_dict())
+    assert torch.equal(pose_of(resumed, person, time=time, step=9).shell.vertices, before.vertices)
+    avatar.before_step(10)
+    after = pose_of(avatar, person, time=time, step=10)
+    torch.testing.assert_close(after.shell.vertices, after.body.vertices.detach(), rtol=0, atol=1e-6)
+
+
+def trained_with(trained, **options):
+    """The trained tiny avatar with other options of its method."""
+    avatar, _ = load(trained.folder)
+    other = replace(avatar.config, **options).build(avatar.subject).eval()
+    other.load_state_dict(avatar.state_dict())
+    return other
+
+
+def pictures(avatar, person):
+    frame = person.splits["novel_view"][0]
+    return draw(avatar, avatar.pose(frame.pose, frame.translation), frame.camera.resized(32, 32), BLACK)
+
+
+def test_error_bounded_and_shell_sampler_draw_the_same_picture(trained, person):
+    """Within one step of 8 bits on average and twelve at any pixel, where both end at the same distance."""
+    shell = ShellSampler(radius=0.06, step=0.004, voxel=0.02, least_weight=0.0)
+    bounded = ErrorBoundedSampler(ends="ray")
+    first, second = (
+        pictures(trained_with(trained, sampler=s, outlier_distance=shell.radius), person) for s in (shell, bounded)
+    )
+    difference = (first.color - second.color).abs()
+    assert first.opacity.mean() > 0.1
+    assert difference.mean() < 1 / 255
+    assert difference.max() < 12 / 255
+
+
+def test_samples_left_out_for_their_small_weight_are_not_missed(trained, person):
+    sampler = trained_with(trained).config.sampler
+    all_, some = (
+        pictures(trained_with(trained, sampler=replace(sampler, least_weight=least)), person) for least in (0.0, 1e-3)
+    )
+    assert (all_.color - some.color).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("neighbours", [2, 7])
+def test_weights_of_several_neighbours_draw_nearly_the_same(trained, person, neighbours):
+    one, several = (pictures(trained_with(trained, neighbours=k), person) for k in (1, neighbours))
+    difference = (one.color - several.color).abs()
+    assert 0 < difference.mean() < 0.03
+
+
+def test_both_samplers_take_several_neighbours(subject, person):
+    avatar = replace(RELEASED, neighbours=3).build(subject).eval()
+    with torch.no_grad():
+        found = avatar.render(rays_of(person, 4), pose_of(avatar, person), BLACK)
+    assert found.color.isfinite().all()
+
+
+def test_outliers_are_empty_in_shading_only_where_asked(subject, person):
+    """As released they are forgotten there: what lies far from the body then shows."""
+    opacity = {}
+    for choice in (True, False):
+        avatar = replace(RELEASED, outliers_in_shading=choice, outlier_distance=0.02).build(subject).eval()
+        with torch.no_grad():
+            opacity[choice] = avatar.render(rays_of(person), pose_of(avatar, person), BLACK).opacity.mean()
+    assert opacity[True] < 0.8 * opacity[False]
+
+
+def test_released_scene_units_thin_or_thicken_the_density(subject, person):
+    metres, scene = (replace(RELEASED, scene_scale=units).build(subject).eval() for units in ("metres", "released"))
+    assert metres.scale == 1
+    assert scene.scale == subject.scene_scale > 1
+    with torch.no_grad():
+        thin, thick = (a.render(rays_of(person), pose_of(a, person), BLACK).opacity.mean() for a in (metres, scene))
+    assert thin < thick
+
+
+def test_one_sample_composites_as_the_formula_says(subject, person):
+    """Opacity of the shell sampler's ray by a plain loop over its samples."""
+    avatar = replace(QUICK, sampler=replace(QUICK.sampler, least_weight=0.0)).build(subject).eval()
+    rays, posed = rays_of(person), pose_of(avatar, person)
+    with torch.no_grad():
+        found = avatar.render(rays, posed, BLACK)
+        samples, nearest, *_ = avatar._place(rays, posed, None)
+        which = int(torch.bincount(samples.ray_index).argmax())
+        own = samples.ray_index == which
+        forward = posed.forward[nearest[own, 0]]
+        moved = samples.points(rays)[own]
+        home = torch.stack([torch.linalg.solve(f[:, :3], x - f[:, 3]) for f, x in zip(forward, moved, strict=True)])
+        density = laplace_density(avatar.field.sdf(home, posed.condition), avatar.beta)
+    light = 1.0
+    for sigma, delta in zip(density.tolist(), samples.delta[own].tolist(), strict=True):
+        light *= math.exp(-sigma * delta)
+    assert 1 - light > 0.05
+    assert float(found.opacity[which]) == pytest.approx(1 - light, abs=2e-4)
+
+
+def losses_of(recipe, avatar, person, step):
+    source = PixelSource(person.train, person.body, person.betas, recipe.training.pixels, person.background)
+    generator = torch.Generator().manual_seed(0)
+    frame, batch = person.train[1], source.draw(1, generator)
+    posed = avatar.pose(frame.pose, frame.translation, frame.time, step)
+    rendering = avatar.render(batch.rays, posed, torch.tensor(person.background), generator)
+    return avatar.losses(rendering, batch, posed, step, generator)
+
+
+def test_perceptual_network_is_used_from_its_step_on_and_is_no_part_of_the_avatar(subject, person):
+    recipe = CASES["fast"]
+    avatar = recipe.method.build(subject)
+    before = list(avatar.state_dict())
+    assert "lpips" not in losses_of(recipe, avatar, person, LATE)
+    network = LPIPS(((4,), (8,)))
+    for parameter in network.parameters():
+        torch.nn.init.uniform_(parameter, 0.1, 0.2)
+    avatar.attach_lpips(network)
+    assert list(avatar.state_dict()) == before
+    assert "lpips" not in losses_of(recipe, avatar, person, recipe.method.losses.lpips_start - 1)
+    terms = losses_of(recipe, avatar, person, recipe.method.losses.lpips_start)
+    assert terms["lpips"] > 0
+    terms["lpips"].backward()
+    assert any(p.grad is not None and p.grad.any() for p in avatar.field.parameters())
+
+
+def test_a_term_without_weight_is_left_out_and_others_count_by_theirs(subject, person):
+    recipe = CASES["fast"]
+    avatar = recipe.method.build(subject)
+    whole = losses_of(recipe, avatar, person, 5)
+    assert set(whole) == {"reconstruction", "common", "eikonal", "mask", "s3im"}
+    avatar.config = replace(avatar.config, losses=replace(avatar.config.losses, mask=0.0, common=2.0, eikonal=0.0))
+    less = losses_of(recipe, avatar, person, 5)
+    assert set(less) == {"reconstruction", "common", "s3im"}
+    assert less["common"].item() == pytest.approx(4 * whole["common"].item())
+
+
+def test_eikonal_points_lie_around_the_canonical_body(subject, person, monkeypatch):
+    avatar = QUICK.build(subject)
+    seen = []
+    original = avatar.field.distance_and_gradient
+    monkeypatch.setattr(avatar.field, "distance_and_gradient", lambda x, pose: (seen.append(x), original(x, pose))[1])
+    losses_of(CASES["quick"], avatar, person, 5)
+    distance = torch.cdist(seen[0], avatar.canonical_points).amin(1)
+    assert len(seen[0]) == QUICK.losses.eikonal_points
+    assert distance.max() < 6 * QUICK.losses.eikonal_spread
+    assert distance.max() > 0.5 * QUICK.losses.eikonal_spread
