@@ -151,23 +151,25 @@ def shape_body(body: Body, betas: Float[Tensor, "n"]) -> ShapedBody:
 
 
 def joint_transforms(
-    joints: Float[Tensor, "24 3"], pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"]
-) -> Float[Tensor, "24 4 4"]:
+    joints: Float[Tensor, "24 3"], pose: Float[Tensor, "*b 24 3"], translation: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 24 4 4"]:
     """Where each joint's frame goes from the T-pose to the world: forward kinematics down SMPL's tree.
 
     The root turns about its own rest joint and `translation` is added afterwards, SMPL's own convention. The result
     acts on points of the T-pose (it is already relative to the rest joints).
     """
     rest = joints.unbind()
-    above = torch.stack([-translation, *(rest[parent] for parent in PARENTS[1:])])
-    local = rigid_transform(axis_angle_to_matrix(pose), joints - above)
-    chain = list(local[:1])
+    above = torch.stack([rest[parent] for parent in PARENTS[1:]])
+    offsets = (joints[1:] - above).expand(*translation.shape[:-1], 23, 3)
+    offsets = torch.cat([(joints[0] + translation)[..., None, :], offsets], -2)
+    local = rigid_transform(axis_angle_to_matrix(pose), offsets)
+    chain = [local[..., 0, :, :]]
     for first, end in itertools.pairwise(_GENERATIONS):
-        parents = torch.stack([chain[parent] for parent in PARENTS[first:end]])
-        chain += (parents @ local[first:end]).unbind()
-    world = torch.stack(chain)
-    moved = (world[:, :3, :3] @ joints[:, :, None])[..., 0]
-    return rigid_transform(world[:, :3, :3], world[:, :3, 3] - moved)
+        parents = torch.stack([chain[parent] for parent in PARENTS[first:end]], -3)
+        chain += (parents @ local[..., first:end, :, :]).unbind(-3)
+    world = torch.stack(chain, -3)
+    moved = (world[..., :3, :3] @ joints[:, :, None])[..., 0]
+    return rigid_transform(world[..., :3, :3], world[..., :3, 3] - moved)
 
 
 def blend_shapes(shaped: ShapedBody, pose: Float[Tensor, "24 3"]) -> Float[Tensor, "V 3"]:

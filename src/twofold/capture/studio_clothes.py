@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
-from scipy.spatial import KDTree
 
 from twofold.capture.studio_anatomy import Anatomy, arm_reach, around_neck, leg_reach, smoothstep
 from twofold.capture.studio_look import Look
+from twofold.geometry.trees import search_tree
 
 SKIN, SHIRT, TROUSERS, SHOES, SOLES, HAIR = range(6)
 """Layers, in the order that `dress` gives."""
@@ -85,7 +85,7 @@ def _shoes(
     print_ = anatomy.rest[anatomy.rest[:, 1] < floor + 0.05]
     low = points[:, 1] < floor + 0.08
     outline = np.full(len(points), 1.0, np.float32)
-    outline[low] = KDTree(print_[:, [0, 2]]).query(points[low][:, [0, 2]], distance_upper_bound=0.2)[0].clip(max=1)
+    outline[low] = search_tree(print_[:, [0, 2]]).query(points[low][:, [0, 2]], distance_upper_bound=0.2)[0].clip(max=1)
     thickness = 0.016 + 0.008 * smoothstep(0.0, -0.08, points[:, 2] - ankle[2])
     slab = np.abs(height - 0.5 * (0.014 - thickness)) - 0.5 * (0.014 + thickness)
     sole = np.maximum(outline - 0.012, slab)

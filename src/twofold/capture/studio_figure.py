@@ -20,6 +20,7 @@ from twofold.capture.studio_anatomy import Anatomy, survey
 from twofold.capture.studio_clothes import HAIR, SHIRT, SKIN, TROUSERS, dress
 from twofold.capture.studio_look import Look
 from twofold.geometry.surfaces import split_edges, vertex_normals
+from twofold.geometry.trees import search_tree
 
 COARSE = 0.018
 FINE = COARSE / 3
@@ -61,7 +62,7 @@ def build_figure(shaped: ShapedBody, look: Look) -> Figure:
         look: what to wear.
     """
     anatomy = survey(shaped)
-    tree = KDTree(anatomy.points)
+    tree = search_tree(anatomy.points)
     low = anatomy.points.min(0) - 0.09
     shape = tuple(int(n) + 1 for n in np.ceil((np.ptp(anatomy.points, axis=0) + 0.18) / COARSE))
     nodes = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 3)

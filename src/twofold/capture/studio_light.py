@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import sparse
-from scipy.spatial import KDTree
 
 from twofold.capture.studio_paint import Paint
+from twofold.geometry.trees import search_tree
 
 
 def _unit(*xyz: float) -> Float[np.ndarray, "3"]:
@@ -38,7 +38,7 @@ def thread_beads(vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, 
     cubes = np.floor((vertices - vertices.min(0)) / _GAP).astype(np.int64)
     key = (cubes[:, 0] * 4096 + cubes[:, 1]) * 4096 + cubes[:, 2]
     index = np.unique(key, return_index=True)[1]
-    distance, near = KDTree(vertices[index]).query(vertices, k=4)
+    distance, near = search_tree(vertices[index]).query(vertices, k=4)
     # Light on the other side of a thin part is none of a vertex's business.
     alike = (normals[index][near] * normals[:, None]).sum(-1).clip(0.02)
     weight = alike / (distance + 0.003)

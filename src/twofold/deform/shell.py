@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import ndimage
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from twofold.deform import shell_kernels
 from twofold.geometry.cameras import Rays, clip_to_box
 from twofold.geometry.samples import Samples
 from twofold.geometry.threads import in_parts
+from twofold.geometry.trees import search_tree
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def build_shell(
     reach = radius / voxel + np.sqrt(3)
     near = np.argwhere(away <= reach)
     centers = (low + (near + 0.5) * voxel).astype(np.float32)
-    tree = KDTree(points, balanced_tree=False, compact_nodes=False)
+    tree = search_tree(points, quick=True)
     listed = min(candidates, len(points))
     distance, nearest = (np.reshape(a, (-1, listed)) for a in tree.query(centers, k=listed, workers=-1))
     keep = distance[:, 0] <= radius + np.sqrt(3) / 2 * voxel

@@ -3,8 +3,9 @@
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 from torch import Tensor
+
+from twofold.geometry.trees import search_tree
 
 
 def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
@@ -36,7 +37,7 @@ def nearest_vertices(
     points: Float[Tensor, "n 3"], vertices: Float[Tensor, "V 3"], k: int = 1
 ) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
     """Distances (metres) to the `k` nearest vertices and their indices, nearest first. Exact; not differentiable."""
-    tree = KDTree(vertices.detach().cpu().numpy())
+    tree = search_tree(vertices.detach().cpu().numpy())
     distances, indices = tree.query(points.detach().cpu().numpy(), k=k)
     return (
         torch.as_tensor(distances, dtype=points.dtype, device=points.device).view(-1, k),
@@ -79,7 +80,7 @@ def point_to_mesh(
     corners = vertices[faces]
     centers = corners.mean(1)
     reach = float((corners - centers[:, None]).norm(dim=-1).max())
-    tree = KDTree(centers.detach().cpu().numpy())
+    tree = search_tree(centers.detach().cpu().numpy())
     distances = torch.full_like(points[:, 0], torch.inf)
     triangles = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     nearest = torch.zeros_like(points)

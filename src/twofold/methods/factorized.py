@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -23,6 +22,7 @@ from twofold.field.factorized_grid import GridFieldConfig
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays, clip_to_box
 from twofold.geometry.samples import Samples
+from twofold.geometry.trees import search_tree
 from twofold.methods.base import Avatar, PosedAvatar, Rendering, Subject
 from twofold.metrics.perceptual import LPIPS
 from twofold.volume.rendering import composite, composite_weights, laplace_density, seen_samples
@@ -319,7 +319,7 @@ class FactorizedAvatar(Avatar):
         low, high = posed.body.joints.detach().amin(0) - margin, posed.body.joints.detach().amax(0) + margin
         clipped, hit = clip_to_box(rays, low, high)
         inside = hit.nonzero()[:, 0]
-        k, tree = self.config.neighbours, KDTree(posed.body.vertices.detach().cpu().numpy())
+        k, tree = self.config.neighbours, search_tree(posed.body.vertices.detach().cpu().numpy())
         limit = self.config.outlier_distance / self.scale
 
         def neighbours(points: Tensor) -> tuple[Tensor, Tensor]:

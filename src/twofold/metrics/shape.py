@@ -7,11 +7,11 @@ below that.
 
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from twofold.errors import TwofoldError
 from twofold.geometry.surfaces import closest_on_triangles, nearest_vertices, sample_surface, vertex_normals
+from twofold.geometry.trees import search_tree
 
 SAMPLES = 10_000
 """Points on each surface; where distances spread over 5 mm, their mean is good to 0.05 mm."""
@@ -121,7 +121,7 @@ def _to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> tuple[Tensor
     size = (vertices.amax(0) - vertices.amin(0)).norm().item()
     corners = _quartered(vertices[faces], size / PIECES)
     k = min(CANDIDATES, len(corners))
-    _, index = KDTree(corners.mean(1).cpu().numpy()).query(points.cpu().numpy(), k=k)
+    _, index = search_tree(corners.mean(1).cpu().numpy()).query(points.cpu().numpy(), k=k)
     a, b, c = corners[torch.as_tensor(index, device=points.device).reshape(-1, k)].unbind(-2)
     feet = closest_on_triangles(points[:, None].expand_as(a), a, b, c)
     distances, nearest = (feet - points[:, None]).norm(dim=-1).min(1)

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 from torch import Tensor
 
@@ -17,6 +16,7 @@ from twofold.body.skeleton import PosedBody
 from twofold.deform.skinning import neighbour_weights, to_posed, vertex_transforms
 from twofold.errors import TwofoldError
 from twofold.geometry.surfaces import face_areas, nearest_vertices
+from twofold.geometry.trees import search_tree
 
 CORNERS = tuple(itertools.product((0, 1), repeat=3))
 """Of a grid cell."""
@@ -104,7 +104,7 @@ def _points_near(near: Tensor, low: Tensor, shape: list[int], spacing: float, ra
     """Which points of a grid are within `radius` of a vertex."""
     index = torch.stack(torch.meshgrid(*[torch.arange(n) for n in shape], indexing="ij"), -1)
     points = (low.cpu() + spacing * index).reshape(-1, 3)
-    distances, _ = KDTree(near.detach().cpu().numpy()).query(points.numpy(), distance_upper_bound=radius)
+    distances, _ = search_tree(near.detach().cpu().numpy()).query(points.numpy(), distance_upper_bound=radius)
     return torch.from_numpy(np.isfinite(distances)).reshape(shape)
 
 
