@@ -59,8 +59,8 @@ $(VENV)/.ready-studio: pyproject.toml constraints.txt | $(VENV)/.made
 	@touch $@
 
 $(VENV)/.ready-all: pyproject.toml constraints.txt | $(VENV)/.made
-	@echo "Setting up $(VENV) with all tools: downloads some 600 MB, once."
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio,test,docs,dev]'
+	@echo "Setting up $(VENV) with all tools: downloads some 900 MB, once."
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio,prepare,test,docs,dev]'
 	@touch $@ $(VENV)/.ready-studio
 
 $(VENV)/.made:
