@@ -48,11 +48,11 @@ def bending(pose: Float[np.ndarray, "24 3"]) -> Float[np.ndarray, "d"]:
     for side, collar in ((1, 13), (-1, 14)):
         turn = Rotation.from_rotvec(pose[collar]) * Rotation.from_rotvec(pose[collar + 3])
         _, y, z = turn.apply([side, 0, 0])
-        elbow = np.linalg.norm(pose[collar + 5])
+        elbow = float(np.linalg.norm(pose[collar + 5]))
         drivers += [elbow / 1.7, max(-y, 0.0) ** 1.5, max(z, 0.0), max(y + 0.1, 0.0)]
     for hip in (1, 2):
         thigh = Rotation.from_rotvec(pose[hip]).apply([0, -1, 0])
-        drivers += [np.linalg.norm(pose[hip + 3]) / 1.2, max(np.arctan2(thigh[2], -thigh[1]) / 0.9, 0.0)]
+        drivers += [float(np.linalg.norm(pose[hip + 3])) / 1.2, max(np.arctan2(thigh[2], -thigh[1]) / 0.9, 0.0)]
     bow, wind, lean = pose[[3, 6, 9]].sum(0)
     for angle, full in ((bow, 0.4), (lean, 0.22), (wind, 0.35)):
         drivers += [max(angle, 0.0) / full, max(-angle, 0.0) / full]
