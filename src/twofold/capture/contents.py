@@ -24,6 +24,8 @@ from twofold.geometry.cameras import Camera
 FORMAT, VERSION = "twofold-capture", 1
 DESCRIPTION, BODY, MOTION = "capture.json", "body.npz", "motion.npz"
 IMAGES, MASKS, IGNORED, MESHES = "images", "masks", "ignored", "meshes"
+CHECK = "check"
+"""What `twofold check` found lies here; nothing reads it."""
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg")
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 """Camera names are folder names, so nothing that leaves the folder or breaks on another system."""

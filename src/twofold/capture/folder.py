@@ -17,6 +17,7 @@ from torch import Tensor
 from twofold.body.skeleton import Body
 from twofold.capture.contents import (
     BODY,
+    CHECK,
     DESCRIPTION,
     FORMAT,
     IGNORED,
@@ -26,6 +27,7 @@ from twofold.capture.contents import (
     MOTION,
     PICTURE_ENDINGS,
     VERSION,
+    Contents,
     file_stem,
     numbered_files,
     read_contents,
@@ -46,9 +48,15 @@ def read_capture(folder: Path | str) -> Capture:
     folder = Path(folder)
     contents, faults = read_contents(folder)
     require(faults + quick_faults(contents), folder)
+    return capture_of(contents)
+
+
+def capture_of(contents: Contents) -> Capture:
+    """The capture that the small files of a folder describe; all pictures that its splits name must be there."""
+    folder = contents.folder
     body, betas, poses, translations = contents.body, contents.betas, contents.poses, contents.translations
     if body is None or betas is None or poses is None or translations is None:
-        raise AssertionError("a part that cannot be read is a fault, and faults were raised above")
+        raise AssertionError("a part that cannot be read is a fault, and faults are raised before")
     images = {camera: contents.files(IMAGES, camera) for camera in contents.pictures}
     masks = {camera: contents.files(MASKS, camera) for camera in contents.pictures}
     ignored = {camera: contents.files(IGNORED, camera) for camera in contents.pictures}
@@ -221,7 +229,7 @@ class CaptureWriter:
             found = {path.name for path in self._folder.iterdir()} if self._folder.is_dir() else set[str]()
         if not found:
             return False
-        foreign = found - {DESCRIPTION, BODY, MOTION, IMAGES, MASKS, IGNORED, MESHES}
+        foreign = found - {DESCRIPTION, BODY, MOTION, IMAGES, MASKS, IGNORED, MESHES, CHECK}
         if DESCRIPTION not in found or foreign:
             holds = f"{sorted(foreign)[0]}, which is no part of a capture" if foreign else "files that are no capture"
             raise TwofoldError(f"The folder {self._folder} holds {holds}; choose another name.")
