@@ -1,32 +1,30 @@
 """Training: one loop for a CPU, a GPU and several processes, readable in one sitting."""
 
 import contextlib
-import csv
-import io
 import math
 import signal
 import threading
+import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.parallel import DistributedDataParallel
-from torch.utils.tensorboard import SummaryWriter
 
 from twofold import losses
 from twofold.capture.pixels import PixelSource
 from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
-from twofold.files import plain_errors, write_atomically
+from twofold.files import plain_errors
 from twofold.methods.base import Avatar, Subject
+from twofold.train.curves import Curves
 from twofold.train.processes import Team, joined
 from twofold.train.run import (
     CHECKPOINT,
-    CURVES,
     Recipe,
     TrainingConfig,
     load_optimizer,
@@ -85,7 +83,7 @@ class Step(nn.Module):
 
 def mixed(*numbers: int) -> int:
     """A seed from several numbers, well spread."""
-    return int(np.random.SeedSequence(list(numbers)).generate_state(1, np.uint64)[0] >> 1)
+    return int(np.random.SeedSequence(list(numbers)).generate_state(1, np.uint64)[0]) >> 1
 
 
 def frame_order(recipe: Recipe, frames: int, step: int) -> list[int]:
@@ -117,41 +115,6 @@ def make_optimizer(avatar: Avatar, config: TrainingConfig) -> torch.optim.Optimi
         if parameters:
             groups.append({"params": parameters, "lr": getattr(config, f"rate_{name}"), "name": name})
     return torch.optim.Adam(groups, betas=config.adam_betas, eps=config.adam_epsilon, fused=True)
-
-
-class Curves:
-    """Losses over time, as a small table that is written whole before every checkpoint, and for TensorBoard."""
-
-    def __init__(self, folder: Path, start: int) -> None:
-        """Continues the table of an interrupted run up to `start`."""
-        self.file = folder / CURVES
-        self.rows: list[dict[str, float]] = []
-        if start and self.file.is_file():
-            try:
-                with self.file.open(newline="", encoding="utf-8") as lines:
-                    rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(lines)]
-                self.rows = [row for row in rows if row["step"] <= start]
-            except (ValueError, TypeError, KeyError):
-                raise TwofoldError(f"{self.file} is damaged; remove it and resume again.") from None
-        self.board = SummaryWriter(str(folder / "tensorboard"), purge_step=start)
-
-    def add(self, row: dict[str, float]) -> None:
-        """Appends one point."""
-        self.rows.append(row)
-        for name, value in row.items():
-            if name != "step":
-                self.board.add_scalar(name, value, int(row["step"]))
-
-    def save(self) -> None:
-        """Writes the table."""
-        names = list(dict.fromkeys(name for row in self.rows for name in row))
-        text = io.StringIO()
-        writer = csv.DictWriter(text, names)
-        writer.writeheader()
-        writer.writerows(self.rows)
-        with write_atomically(self.file) as beside:
-            beside.write_text(text.getvalue(), encoding="utf-8")
-        self.board.flush()
 
 
 def train(
@@ -200,11 +163,10 @@ def train(
         source = PixelSource(capture.train, subject.body, subject.betas, config.pixels, capture.background, margin)
         module: nn.Module = Step(avatar, source, torch.tensor(capture.background, device=device), recipe)
         if team.size > 1:
-            # Which parameters take part changes with the schedules (poses, pose-dependent branch).
-            module = DistributedDataParallel(module, find_unused_parameters=True, broadcast_buffers=False)
+            module = team.shared(module)
         curves = Curves(folder, start) if team.leads else None
         if curves is not None:
-            at_the_end.callback(curves.board.close)
+            at_the_end.callback(curves.close)
         base_rates = [group["lr"] for group in optimizer.param_groups]
         for step in range(start, config.steps):
             avatar.before_step(step)
@@ -289,20 +251,22 @@ def _scale(avatar: Avatar) -> dict[str, float]:
 def asked_to_stop() -> Generator[Callable[[], bool], None, None]:
     """Ctrl-C as a question that the loop asks between steps, so that no step is ever half applied.
 
-    A second Ctrl-C interrupts at once, as usual. Outside the main thread, signals are somebody else's.
+    A second Ctrl-C interrupts at once, as usual, but only a second later: `torchrun` passes on what the terminal has
+    sent already. Outside the main thread, signals are somebody else's.
     """
-    asked = False
+    asked = math.inf
 
-    def note(number: int, stack: object) -> None:
+    def note(number: int, stack: FrameType | None) -> None:
         nonlocal asked
-        asked = True
-        signal.signal(number, signal.default_int_handler)
+        if time.monotonic() - asked >= 1:
+            signal.default_int_handler(number, stack)
+        asked = min(asked, time.monotonic())
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
     before = signal.signal(signal.SIGINT, note)
     try:
-        yield lambda: asked
+        yield lambda: asked < math.inf
     finally:
         signal.signal(signal.SIGINT, before)
