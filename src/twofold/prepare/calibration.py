@@ -1,0 +1,252 @@
+"""Cameras that were calibrated before: matched to clips, brought to their picture size, freed of lens distortion.
+
+Pixels are counted as everywhere here: column i and row j of a picture is the point (i, j).
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+
+from twofold.errors import TwofoldError
+from twofold.geometry.cameras import Camera
+
+_CROPPED = 16
+"""Video coders pad pictures to multiples of 16 pixels, and players cut that off again, right and below."""
+
+
+@dataclass(frozen=True)
+class CalibratedCamera:
+    """One calibrated camera that does not move (OpenCV: x right, y down, z forward).
+
+    Attributes:
+        name: as the calibration calls it.
+        intrinsics: [fx s cx; 0 fy cy; 0 0 1], pixels.
+        distortion: OpenCV's k1, k2, p1, p2, k3.
+        world_to_camera: rigid, metres; which way is up in the world is not known.
+        height: rows of the pictures it was calibrated for; None where the calibration does not say.
+        width: columns of them.
+    """
+
+    name: str
+    intrinsics: Float[np.ndarray, "3 3"]
+    distortion: Float[np.ndarray, "5"]
+    world_to_camera: Float[np.ndarray, "4 4"]
+    height: int | None
+    width: int | None
+
+    @property
+    def center(self) -> Float[np.ndarray, "3"]:
+        """Its position in the world, metres."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    def without_distortion(self) -> "CalibratedCamera":
+        """The camera that took the undistorted pictures."""
+        return replace(self, distortion=np.zeros(5))
+
+
+def pinhole(camera: CalibratedCamera, height: int, width: int) -> Camera:
+    """The camera of undistorted pictures of this size, as captures have it."""
+    matrices = [torch.as_tensor(m.astype(np.float32)) for m in (camera.world_to_camera, camera.intrinsics)]
+    return Camera(matrices[0], matrices[1], height, width)
+
+
+def match_cameras(cameras: Mapping[str, CalibratedCamera], clips: Sequence[str]) -> list[CalibratedCamera]:
+    """The camera of each clip: by name, else in order.
+
+    A name fits if it is the same, the same but for case and separators ("CAM_1" and "cam01"), part of the other
+    ("cam01" and "walk_cam01_left"), or ends in the same number ("1" and "video-01"). Only where no clip's name says
+    anything are as many clips as cameras taken in order.
+
+    Args:
+        cameras: by name, in the calibration's order.
+        clips: names of the clips, without folder and ending.
+
+    Raises:
+        TwofoldError: neither works.
+    """
+    if len(set(clips)) < len(clips):
+        raise TwofoldError(f"Two videos are called {_twice(clips)}; rename one after its camera ({_list(cameras)}).")
+    names, some = list(cameras), False
+    for fits in (_same, _same_words, _part_of, _same_number):
+        candidates = [[name for name in names if fits(clip, name)] for clip in clips]
+        chosen = [found[0] for found in candidates if len(found) == 1]
+        if len(set(chosen)) == len(clips):
+            return [cameras[name] for name in chosen]
+        some = some or (fits is not _same_number and any(candidates))
+    if len(clips) == len(cameras) and not some:
+        return list(cameras.values())
+    raise TwofoldError(
+        f"The videos ({_list(clips)}) cannot be told apart by the cameras of the calibration ({_list(cameras)}); "
+        "rename each video after its camera, or give exactly one for each camera in the calibration's order."
+    )
+
+
+def for_pictures(camera: CalibratedCamera, picture: UInt8[np.ndarray, "h w 3"]) -> CalibratedCamera:
+    """The camera of a clip whose pictures were cut or resized after the calibration.
+
+    In this order: the same size; the same shape, so scaled; scaled with black bars on both sides, which must be seen
+    in `picture`; a few columns or rows less or more, so cut or padded on the right or below, as video coders do.
+
+    Args:
+        camera: as calibrated.
+        picture: any one of the clip as decoded (8-bit sRGB), upright.
+
+    Raises:
+        TwofoldError: the sizes do not go together.
+    """
+    height, width = picture.shape[:2]
+    if camera.height is None or camera.width is None:
+        cx, cy = camera.intrinsics[:2, 2]
+        if not (0.2 * width < cx < 0.8 * width and 0.2 * height < cy < 0.8 * height):
+            raise TwofoldError(
+                f"Camera {camera.name} has its principal point at ({cx:.0f}, {cy:.0f}), far from the middle of its "
+                f"{width}x{height} pictures; give the video in the size it was calibrated in."
+            )
+        return replace(camera, height=height, width=width)
+    if (height, width) == (camera.height, camera.width):
+        return camera
+    across, down = width / camera.width, height / camera.height
+    if min(abs(camera.height * across - height), abs(camera.width * down - width)) <= 1:
+        return _resized(camera, height, width, (across, down), (0.0, 0.0))
+    scale = min(across, down)
+    left, top = (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
+    if _has_bars(picture, round(top), round(left)):
+        return _resized(camera, height, width, (scale, scale), (left, top))
+    if max(abs(width - camera.width), abs(height - camera.height)) <= min(_CROPPED, 0.02 * max(height, width)):
+        return replace(camera, height=height, width=width)
+    turned = abs(across * camera.width / camera.height - down * camera.height / camera.width) < 0.02
+    raise TwofoldError(
+        f"Camera {camera.name} was calibrated for {camera.width}x{camera.height} pictures, its video has "
+        f"{width}x{height}; "
+        + ("turn the video upright as it was calibrated." if turned else "give the video as it was calibrated.")
+    )
+
+
+def distort(camera: CalibratedCamera, pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
+    """Where the lens shows what a perfect one would show at `pixels` (column, row)."""
+    k1, k2, p1, p2, k3 = camera.distortion
+    plane = _to_plane(camera.intrinsics, pixels)
+    x, y = plane[..., 0], plane[..., 1]
+    r = x * x + y * y
+    radial = 1 + r * (k1 + r * (k2 + r * k3))
+    u = x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x)
+    v = y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y
+    return _to_pixels(camera.intrinsics, np.stack([u, v], -1))
+
+
+def undistort(camera: CalibratedCamera, pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
+    """Where a perfect lens would show what this one shows at `pixels`: the inverse of `distort`, to 0.001 pixels."""
+    ideal = pixels.astype(np.float64)
+    if not camera.distortion.any():
+        return ideal
+    for _ in range(100):
+        step = pixels - distort(camera, ideal)
+        ideal = ideal + step
+        if not np.nanmax(np.abs(step), initial=0.0) > 1e-3:
+            break
+    return ideal
+
+
+def largest_distortion(camera: CalibratedCamera, height: int, width: int) -> float:
+    """How far the lens moves a point of a picture of this size at most, pixels."""
+    grid = _grid(np.linspace(0, height - 1, 33), np.linspace(0, width - 1, 33))
+    return float(np.linalg.norm(distort(camera, grid) - grid, axis=-1).max())
+
+
+def undistorter(
+    camera: CalibratedCamera, height: int, width: int
+) -> Callable[[UInt8[np.ndarray, "h w c"]], UInt8[np.ndarray, "h w c"]]:
+    """Turns pictures of this camera into what a perfect lens would have shown, of the same size.
+
+    What no pixel showed repeats the nearest one. The pictures belong to `camera.without_distortion()`.
+    """
+    source = distort(camera, _grid(np.arange(height), np.arange(width)))
+    across, down = 2 * source[..., 0] / max(width - 1, 1) - 1, 2 * source[..., 1] / max(height - 1, 1) - 1
+    where = torch.as_tensor(np.stack([across, down], -1)[None].astype(np.float32))
+
+    def straighten(picture: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
+        planes = torch.as_tensor(picture.astype(np.float32)).permute(2, 0, 1)[None]
+        moved = torch.nn.functional.grid_sample(planes, where, padding_mode="border", align_corners=True)
+        return moved[0].permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).numpy()
+
+    return straighten
+
+
+def _grid(rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "h w 2"]:
+    down, across = np.meshgrid(rows.astype(np.float64), columns.astype(np.float64), indexing="ij")
+    return np.stack([across, down], -1)
+
+
+def _to_plane(intrinsics: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Points on the plane at depth 1."""
+    y = (pixels[..., 1] - intrinsics[1, 2]) / intrinsics[1, 1]
+    x = (pixels[..., 0] - intrinsics[0, 2] - intrinsics[0, 1] * y) / intrinsics[0, 0]
+    return np.stack([x, y], -1)
+
+
+def _to_pixels(intrinsics: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    return plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
+
+
+def _resized(
+    camera: CalibratedCamera, height: int, width: int, scale: tuple[float, float], corner: tuple[float, float]
+) -> CalibratedCamera:
+    """Pictures scaled and laid down with their left upper corner at `corner` (column, row) of larger ones."""
+    intrinsics = camera.intrinsics.copy()
+    intrinsics[:2] *= np.array(scale)[:, None]
+    # The picture's edge lies half a pixel outside of its first pixel.
+    intrinsics[:2, 2] += np.array(corner) + 0.5 * (np.array(scale) - 1)
+    return replace(camera, intrinsics=intrinsics, height=height, width=width)
+
+
+def _has_bars(picture: UInt8[np.ndarray, "h w 3"], top: int, left: int) -> bool:
+    """Whether both sides are black for `top` rows or `left` columns (the other is 0), but not for much more."""
+    if top < 2 and left < 2:
+        return False
+    lines = picture if top >= 2 else picture.swapaxes(0, 1)
+    bar = max(top, left)
+    dark: Bool[np.ndarray, "n"] = np.percentile(lines.reshape(len(lines), -1), 90, axis=1) < 24
+    outer = np.concatenate([dark[: bar - 1], dark[len(dark) - bar + 1 :]])
+    inner = np.concatenate([dark[bar + 2 : bar + 10], dark[len(dark) - bar - 10 : len(dark) - bar - 2]])
+    return bool(outer.all() and not inner.all())
+
+
+def _words(name: str) -> list[str]:
+    """Letters and numbers of a name, apart, without leading zeros.
+
+    >>> _words("CAM_01b")
+    ['cam', '1', 'b']
+    """
+    return [word.lstrip("0") or word[-1:] for word in re.findall(r"[a-z]+|\d+", name.casefold())]
+
+
+def _same(clip: str, camera: str) -> bool:
+    return clip == camera
+
+
+def _same_words(clip: str, camera: str) -> bool:
+    return bool(_words(clip)) and _words(clip) == _words(camera)
+
+
+def _part_of(clip: str, camera: str) -> bool:
+    longer, shorter = sorted((_words(clip), _words(camera)), key=len, reverse=True)
+    if not any(word.isalpha() for word in shorter):  # a bare number is in far too many names
+        return False
+    return any(longer[i : i + len(shorter)] == shorter for i in range(len(longer)))
+
+
+def _same_number(clip: str, camera: str) -> bool:
+    numbers = [[word for word in _words(name) if word.isdecimal()][-1:] for name in (clip, camera)]
+    return bool(numbers[0]) and numbers[0] == numbers[1]
+
+
+def _twice(names: Sequence[str]) -> str:
+    return next(name for name in names if names.count(name) > 1)
+
+
+def _list(names: Sequence[str] | Mapping[str, object]) -> str:
+    return ", ".join(names)
