@@ -5,10 +5,13 @@ What a command needs is imported when it runs, so that `--help` answers at once.
 
 import functools
 import os
+import shlex
 import sys
+import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -25,6 +28,8 @@ Parts = Literal["all", "orbit", "views", "poses", "canonical"]
 Recipes = Literal["quick", "fast", "released", "paper"]
 _alone = os.environ.get("RANK", "0") == "0"
 """Of several processes that train together, the first one speaks for all."""
+LINE_EVERY = 30.0
+"""Seconds after which progress is told anew where standard error is no terminal, and at every tenth of the way."""
 
 
 def _console() -> Console:
@@ -34,14 +39,31 @@ def _console() -> Console:
 
 @contextmanager
 def _bar(title: str) -> Generator[Callable[[float, str], None], None, None]:
-    """A progress bar; the function it gives takes the share that is done and a word about it."""
+    """A progress bar, or a line now and then where nobody watches a terminal.
+
+    The function it gives takes the share that is done and a word about it.
+    """
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
+    console = _console()
     with Progress(
         *columns, TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
-        console=_console(), refresh_per_second=4, speed_estimate_period=60,
+        console=console, refresh_per_second=4, speed_estimate_period=60, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
         task = progress.add_task(title, total=1.0, note="")
-        yield lambda done, note: progress.update(task, completed=done, note=note)
+        told, last = 0, time.monotonic()
+
+        def show(done: float, note: str) -> None:
+            nonlocal told, last
+            progress.update(task, completed=done, note=note)
+            tenths, now = int(10 * done), time.monotonic()
+            if console.is_terminal or (tenths == told and now - last < LINE_EVERY):
+                return
+            told, last = tenths, now
+            left = progress.tasks[0].time_remaining
+            parts = [f"{100 * done:.0f} %", *([f"{timedelta(seconds=int(left))} left"] if left else []), note]
+            console.print(f"{title}: {', '.join(filter(None, parts))}", soft_wrap=True)
+
+        yield show
 
 
 def studio(
@@ -120,7 +142,7 @@ def train(
     from twofold.capture.validate import require, validate
     from twofold.outputs.gallery import save_preview
     from twofold.train import loop
-    from twofold.train.run import choose_device, find_capture, read_recipe
+    from twofold.train.run import RECIPE, choose_device, find_capture, read_recipe
 
     if resume is None:
         chosen, folder, source = _new_run(capture, out, recipe, set, seed)
@@ -143,7 +165,12 @@ def train(
                 lambda avatar, step: save_preview(avatar, read, folder, step),
             )  # fmt: skip
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"The training continues with: twofold train --resume {folder}") from None
+        if not (folder / RECIPE).is_file():
+            raise
+        moved = [str(capture)] if resume and capture else []
+        where_asked = ["--device", device] if device != "auto" else []
+        words = ["twofold", "train", *moved, "--resume", str(folder), *where_asked]
+        raise KeyboardInterrupt(f"The training continues with: {shlex.join(words)}") from None
     _say(f"The avatar is in {folder}.", f"twofold render {folder}")
 
 
@@ -308,8 +335,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tune_process()
         command()
     except TwofoldError as error:
-        if _alone:
-            print(f"twofold: {error}", file=sys.stderr)
+        print(f"twofold{'' if _alone else ', process ' + os.environ['RANK']}: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
         if _alone:

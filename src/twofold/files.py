@@ -6,6 +6,7 @@ half a file and a killed program leaves the old one as it was.
 
 import contextlib
 import errno
+import io
 import json
 import os
 import secrets
@@ -116,11 +117,13 @@ def new_folder(path: Path | str, replace: bool = False) -> Generator[Path, None,
             temporary.mkdir()
             yield temporary
             _put_in_place(temporary, target)
-        except BaseException:
+        except BaseException as error:
             shutil.rmtree(temporary, ignore_errors=True)
             for folder in reversed(made):
                 with contextlib.suppress(OSError):
                     folder.rmdir()
+            if isinstance(error, TwofoldError):  # under the name that the user knows
+                raise TwofoldError(str(error).replace(str(temporary), str(path))) from error
             raise
 
 
@@ -174,8 +177,10 @@ def write_npz(path: Path | str, arrays: dict[str, np.ndarray]) -> None:
     objects = [name for name, array in arrays.items() if array.dtype.hasobject]
     if objects:
         raise TypeError(f"Only plain arrays are written, these hold Python objects: {', '.join(objects)}.")
-    with write_atomically(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+    # Not straight to the file: NumPy leaves an archive behind when the disk is full, which complains when it is freed.
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
+    write_bytes(path, buffer.getvalue())
 
 
 def read_json(path: Path | str) -> Any:
