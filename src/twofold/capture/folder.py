@@ -155,6 +155,10 @@ class CaptureWriter:
         """A mask file (PNG) taken over as it is."""
         self._copy(MASKS, camera, time, source)
 
+    def ignored_file(self, camera: str, time: int, source: Path) -> None:
+        """A file of ignored pixels (PNG) taken over as it is."""
+        self._copy(IGNORED, camera, time, source)
+
     def mesh(self, time: int, vertices: Float[np.ndarray, "V 3"], faces: np.ndarray) -> None:
         """The true surface of a moment: vertices in the world, metres, and triangles."""
         buffer = io.BytesIO()

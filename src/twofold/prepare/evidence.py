@@ -14,7 +14,7 @@ from twofold.prepare.body_points import BodyPoints
 from twofold.prepare.first_guess import first_pose, first_translation
 from twofold.prepare.motion import Motion, place_points, pose_motion
 from twofold.prepare.observations import Track
-from twofold.prepare.outlines import Outlines
+from twofold.prepare.outlines import Mask, Outlines
 
 
 @dataclass(frozen=True)
@@ -24,16 +24,17 @@ class Evidence:
     Attributes:
         camera: with a guess of the focal length where that is unknown.
         track: landmarks, sides repaired.
-        outlines: of the masks; None where there are none.
+        masks: of each moment, as arrays (0..255) or as picture files, which keeps the memory of long clips small;
+            None where there are none.
     """
 
     camera: Camera
     track: Track
-    outlines: Outlines | None
+    masks: Sequence[Mask] | None = None
 
     def __getitem__(self, times: slice) -> "Evidence":
         parts = {name: value[times] for name, value in vars(self.track).items()}
-        return Evidence(self.camera, Track(**parts), None if self.outlines is None else self.outlines[times])
+        return Evidence(self.camera, Track(**parts), None if self.masks is None else self.masks[times])
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,11 @@ class Seen:
     size: Float[Tensor, "c"]
 
 
-def gather(evidence: Sequence[Evidence], points_in_space: Float[np.ndarray, "t 33 3"] | None) -> Seen:
+def gather(
+    evidence: Sequence[Evidence],
+    outlines: Sequence[Outlines | None],
+    points_in_space: Float[np.ndarray, "t 33 3"] | None,
+) -> Seen:
     """Evidence of all cameras; landmarks in space are taken from `points_in_space` (world, metres) where given."""
     cameras = [e.camera for e in evidence]
     pixels = torch.from_numpy(np.stack([e.track.pixels for e in evidence])).float()
@@ -63,7 +68,7 @@ def gather(evidence: Sequence[Evidence], points_in_space: Float[np.ndarray, "t 3
     # A guess about what is hidden is worth little, but better than nothing.
     weight = torch.where(there, weight.clamp_min(0.02) ** 2, 0)
     found = (weight > 0).any(-1, keepdim=True)
-    sizes = [e.outlines.size if e.outlines is not None else _height(e.track) for e in evidence]
+    sizes = [_height(e.track) if o is None else o.size for e, o in zip(evidence, outlines, strict=True)]
     return Seen(
         world_to_camera,
         torch.stack([c.intrinsics for c in cameras]).float(),

@@ -19,7 +19,7 @@ from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angl
 from twofold.prepare.body_points import body_points
 from twofold.prepare.evidence import Evidence, begin, gather
 from twofold.prepare.motion import Chosen, Motion, Posed, choose, pose_motion
-from twofold.prepare.outlines import Outlines
+from twofold.prepare.outlines import Outlines, trace_outlines
 from twofold.prepare.terms import PriorWeights, direction_term, landmark_term, match_rims, outline_term, prior
 
 WINDOW, OVERLAP = 240, 24
@@ -147,7 +147,8 @@ def _fit_window(
     watch: Callable[[float], None],
 ) -> Motion:
     points = body_points(body)
-    seen = gather(evidence, points_in_space)
+    outlines = [None if e.masks is None else trace_outlines(e.masks) for e in evidence]
+    seen = gather(evidence, outlines, points_in_space)
     motion = begin(body, points, seen)
     if known is not None:
         motion = replace(motion, betas=known.betas, marks=known.marks, log_focal=known.log_focal)
@@ -173,7 +174,7 @@ def _fit_window(
         half = (config.steps[0] - few) // 2
         motion = _descend(body, motion, changing, everything(config.direction_weight, wide), half, config.rate)
     watch(config.steps[0] / total)
-    masks = [(k, e.outlines) for k, e in enumerate(evidence) if e.outlines is not None]
+    masks = [(k, o) for k, o in enumerate(outlines) if o is not None]
     rounds = max(1, config.steps[1] // config.rematch) if masks else 0
     count = len(body.template)
     searched, skin = (choose(body, torch.arange(0, count, max(1, count // n))) for n in (4500, 450))
@@ -187,8 +188,8 @@ def _fit_window(
             motion: Motion, posed: Posed, matched: list[_Matched] = matched, width: float = width
         ) -> Tensor:
             loss = base(motion, posed)
-            for k, outlines, rims, weight in matched:
-                term = outline_term(posed, motion, seen, k, outlines, rims, weight, skin, width)
+            for k, traced, rims, weight in matched:
+                term = outline_term(posed, motion, seen, k, traced, rims, weight, skin, width)
                 loss = loss + config.outline_weight * term
             return loss
 

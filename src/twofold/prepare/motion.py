@@ -54,6 +54,12 @@ class Motion:
         root = matrix_to_axis_angle(axis_angle_to_matrix(self.root) @ self.guess)
         return torch.cat([root[:, None], self.pose], 1)
 
+    def settled(self, body: Body) -> "Motion":
+        """The same motion with the distance told by the translations."""
+        root = body.joints[0] + body.joint_basis[0, :, : len(self.betas)] @ self.betas
+        moved = (root + self.translation) * self.log_distance.exp() - root
+        return replace(self, translation=moved, log_distance=torch.zeros_like(self.log_distance))
+
     def detached(self) -> "Motion":
         """The same numbers, to start another optimisation from."""
         return Motion(**{name: value.detach().clone() for name, value in vars(self).items()})

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -57,9 +58,21 @@ class Outlines:
         return found[:, 0, :, 0]
 
 
-def trace_outlines(masks: Sequence[UInt8[np.ndarray, "h w"]]) -> Outlines:
-    """Outlines of the masks of a clip (0..255, the person above 127)."""
-    traced = [_trace(mask) for mask in masks]
+Mask = UInt8[np.ndarray, "h w"] | Path
+"""A mask (0..255, the person above 127) or the picture file that holds it."""
+
+
+def open_mask(mask: Mask) -> UInt8[np.ndarray, "h w"]:
+    """The mask as an array."""
+    if not isinstance(mask, Path):
+        return mask
+    with Image.open(mask) as picture:
+        return np.asarray(picture.convert("L"))
+
+
+def trace_outlines(masks: Sequence[Mask]) -> Outlines:
+    """Outlines of the masks of a clip."""
+    traced = [_trace(open_mask(mask)) for mask in masks]
     outside, corner, cell, points, normals, longer = (
         torch.from_numpy(np.stack(part)).float() for part in zip(*traced, strict=True)
     )

@@ -1,0 +1,119 @@
+"""The fitted body held against every picture: objects taken out of the masks, and a record of each picture."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+
+from twofold.body.skeleton import Body
+from twofold.capture.masks import SeenBody, see_body, usual_colors, without_objects
+from twofold.files import plain_errors
+from twofold.geometry.cameras import Camera, project
+from twofold.prepare.body_points import body_points
+from twofold.prepare.motion import Motion, Posed, choose, place_points, pose_motion
+from twofold.prepare.outlines import open_mask
+from twofold.prepare.quality import PictureQuality, picture_quality
+from twofold.prepare.watch import Watched, spread_out
+
+_COLOR_SAMPLE = 120
+"""Pictures from which a vertex's usual colour is learned."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What came of one camera's pictures.
+
+    Attributes:
+        qualities: one for each picture.
+        ignored: files of the pixels that objects hide, by moment.
+    """
+
+    qualities: tuple[PictureQuality, ...]
+    ignored: dict[int, Path]
+
+
+def compare_with_pictures(
+    name: str,
+    camera: Camera,
+    watched: Watched,
+    body: Body,
+    motion: Motion,
+    size: float,
+    held_objects: Literal["keep", "remove"],
+    show: Callable[[float], None],
+) -> Agreement:
+    """Goes through a camera's pictures with the body that was fitted; masks with objects in them are written anew.
+
+    Args:
+        name: of the camera.
+        camera: with the focal length that was found.
+        watched: pictures, masks and landmarks.
+        body: that was fitted.
+        motion: settled, in the camera's world.
+        size: of the person in the pictures, pixels.
+        held_objects: "remove" takes balls and the like out of the masks and marks what they hide.
+        show: told the share that is done.
+    """
+    posed = pose_motion(body, motion)
+    shown = project(camera, place_points(posed, body_points(body), motion))[0].numpy()
+    everything = choose(body, torch.arange(len(body.template)))
+    faces, focal = body.faces.numpy(), float(camera.intrinsics[0, 0])
+
+    def see(time: int) -> SeenBody | None:
+        one = Posed(posed.transforms[time : time + 1], posed.vertices)
+        pixels, depth = project(camera, one.place(everything)[0])
+        if float(depth.min()) <= 0.01:
+            return None
+        return see_body(pixels.numpy(), depth.numpy(), faces, focal, camera.height, camera.width)
+
+    usual = _usual(watched, see) if held_objects == "remove" else None
+    qualities: list[PictureQuality] = []
+    ignored: dict[int, Path] = {}
+    for time in range(len(motion)):
+        seen = see(time)
+        mask = open_mask(watched.masks[time])
+        iou = 0.0
+        if seen is not None and (mask > 127).any():
+            if usual is not None:
+                with Image.open(watched.images[time]) as picture:
+                    image = np.asarray(picture.convert("RGB"))
+                mask, hidden, _ = without_objects(mask, image, seen, *usual)
+                if hidden.any():
+                    ignored[time] = watched.masks[time].with_suffix(".ignored.png")
+                    with plain_errors(watched.masks[time].parent):
+                        Image.fromarray(mask).save(watched.masks[time], compress_level=1)
+                        Image.fromarray(hidden * np.uint8(255)).save(ignored[time], compress_level=1)
+            silhouette, person = seen.silhouette(camera.height, camera.width), mask > 127
+            counted = np.ones_like(person) if time not in ignored else open_mask(ignored[time]) == 0
+            iou = float((silhouette & person & counted).sum() / max(((silhouette | person) & counted).sum(), 1))
+        track = watched.track
+        qualities.append(
+            picture_quality(name, camera, time, iou, shown[time], track.pixels[time], track.visibility[time], size)
+        )
+        show((time + 1) / len(motion))
+    return Agreement(tuple(qualities), ignored)
+
+
+def _usual(
+    watched: Watched, see: Callable[[int], SeenBody | None]
+) -> tuple[Float[np.ndarray, "V 3"], Bool[np.ndarray, "V"]] | None:
+    """The usual colours of the body's vertices."""
+    colors: list[UInt8[np.ndarray, "V 3"]] = []
+    visible: list[Bool[np.ndarray, "V"]] = []
+    times: Sequence[int] = spread_out(len(watched.images), _COLOR_SAMPLE)
+    for time in times:
+        seen = see(time)
+        if seen is None:
+            continue
+        with Image.open(watched.images[time]) as picture:
+            image = np.asarray(picture.convert("RGB"))
+        mask = open_mask(watched.masks[time])
+        column, row = np.where(seen.visible[:, None], seen.pixels, 0).T
+        colors.append(image[row, column])
+        visible.append(seen.visible & (mask[row, column] > 127))
+    return usual_colors(np.stack(colors), np.stack(visible)) if colors else None

@@ -1,0 +1,154 @@
+"""The clips that a capture is made from, each with the camera that took it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from twofold.errors import TwofoldError
+from twofold.geometry.cameras import Camera
+from twofold.prepare.calibration import CalibratedCamera, for_pictures, largest_distortion, match_cameras, pinhole
+from twofold.prepare.calibration_files import read_calibration
+from twofold.prepare.frames import ClipInfo, Frames
+
+FOCAL_GUESS = 1.1
+"""Times the longer side of a picture: between a phone's wide lens and a camera's usual one."""
+
+_LENS_MATTERS = 0.5
+"""Pictures are straightened where the lens moves a point by more pixels than this."""
+
+
+@dataclass(frozen=True)
+class PrepareConfig:
+    """What to make of the clips.
+
+    Attributes:
+        fps: pictures a second to use; None for all.
+        max_size: longer side of the pictures, pixels; larger ones are made smaller.
+        intrinsics: fx, fy, cx, cy in pixels of the clip itself; None to find the focal length.
+        calibration: file or folder with the cameras of several clips.
+        train_camera: which clip trains where there are several, by its name; None for the first.
+        held_out: of so many moments one is kept for testing.
+        held_objects: whether balls and the like are taken out of the masks.
+        credit: whom to name when showing the pictures.
+    """
+
+    fps: float | None = None
+    max_size: int = 960
+    intrinsics: tuple[float, float, float, float] | None = None
+    calibration: Path | None = None
+    train_camera: str | None = None
+    held_out: int = 10
+    held_objects: Literal["keep", "remove"] = "remove"
+    credit: str = ""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One clip, ready to be looked at.
+
+    Attributes:
+        name: of its camera.
+        path: where it lies.
+        frames: its pictures.
+        info: what will come of it.
+        camera: that took it, for pictures without distortion.
+        lens: how to take the distortion out of a picture; None where there is next to none.
+        calibrated: the camera in the calibration's precision; None where it was guessed.
+    """
+
+    name: str
+    path: Path
+    frames: Frames
+    info: ClipInfo
+    camera: Camera
+    lens: CalibratedCamera | None
+    calibrated: CalibratedCamera | None
+
+
+def require_options(clips: Sequence[Path], config: PrepareConfig) -> None:
+    """Refuses options that do not go together.
+
+    Raises:
+        TwofoldError: as it says.
+    """
+    if not clips:
+        raise TwofoldError("Expected at least one video or folder of pictures; none was given.")
+    if len(clips) > 1 and config.calibration is None:
+        raise TwofoldError(
+            f"{len(clips)} videos were given, which need --calibration FILE to say where their cameras stand; "
+            "give one, or prepare a single video."
+        )
+    if config.intrinsics is not None and (config.calibration is not None or min(config.intrinsics[:2]) <= 0):
+        raise TwofoldError("--intrinsics are fx,fy,cx,cy in pixels, fx and fy above 0, and go without --calibration.")
+    if config.held_out < 3:
+        raise TwofoldError(
+            f"One moment of {config.held_out} cannot be held out between two that train; take 3 or more."
+        )
+
+
+def open_clips(clips: Sequence[Path], config: PrepareConfig) -> list[Clip]:
+    """The clips with their cameras, calibrated or guessed.
+
+    Raises:
+        TwofoldError: a clip or the calibration cannot be read, or they do not go together.
+    """
+    names = [clip.stem if clip.is_file() else clip.name for clip in clips]
+    lenses: list[CalibratedCamera] | None = None
+    if config.calibration is not None:
+        lenses = match_cameras(read_calibration(config.calibration), names)
+    ready: list[Clip] = []
+    for k, (name, clip) in enumerate(zip(names, clips, strict=True)):
+        frames = Frames(clip, config.fps, config.max_size)
+        info = frames.info
+        if lenses is None:
+            ready.append(Clip(_folder_name(name), clip, frames, info, _guessed(info, config), None, None))
+            continue
+        lens = for_pictures(lenses[k], next(iter(Frames(clip, config.fps))).image)
+        small = _smaller(lens, info)
+        straight = largest_distortion(small, info.height, info.width) <= _LENS_MATTERS
+        camera = small.without_distortion()
+        seen = pinhole(camera, info.height, info.width)
+        ready.append(Clip(_folder_name(name), clip, frames, info, seen, None if straight else small, camera))
+    rates = {round(clip.info.fps, 2) for clip in ready}
+    if len(rates) > 1:
+        words = ", ".join(f"{clip.name} {clip.info.fps:.4g}" for clip in ready)
+        raise TwofoldError(f"The videos have different frame rates ({words}); give one that all reach with --fps.")
+    return ready
+
+
+def _folder_name(name: str) -> str:
+    """A camera's name out of a file's: letters, digits, '_', '-' and '.' only."""
+    kept = "".join(c if c.isascii() and (c.isalnum() or c in "_-.") else "_" for c in name).lstrip("-.")
+    return kept or "cam"
+
+
+def _guessed(info: ClipInfo, config: PrepareConfig) -> Camera:
+    """A camera at the world's origin."""
+    across, down = info.width / info.full_width, info.height / info.full_height
+    if config.intrinsics is None:
+        fx = fy = FOCAL_GUESS * max(info.width, info.height)
+        cx, cy = (info.width - 1) / 2, (info.height - 1) / 2
+    else:
+        fx, fy, cx, cy = config.intrinsics
+        fx, fy, cx, cy = fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
+    return Camera(torch.eye(4), torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), info.height, info.width)
+
+
+def _smaller(lens: CalibratedCamera, info: ClipInfo) -> CalibratedCamera:
+    """The lens as it is in the smaller pictures; distortion does not change with the size."""
+    scale = np.array([info.width / info.full_width, info.height / info.full_height])
+    intrinsics = lens.intrinsics.copy()
+    intrinsics[:2] *= scale[:, None]
+    intrinsics[:2, 2] += 0.5 * (scale - 1)
+    return replace(lens, intrinsics=intrinsics, height=info.height, width=info.width)
+
+
+def longer(camera: Camera, factor: float) -> Camera:
+    """The camera with another focal length."""
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[0, 0], intrinsics[1, 1] = intrinsics[0, 0] * factor, intrinsics[1, 1] * factor
+    return Camera(camera.world_to_camera, intrinsics, camera.height, camera.width)
