@@ -1,6 +1,7 @@
 """Bad input gets one sentence and exit code 2, and leaves nothing half written."""
 
 import contextlib
+import functools
 import json
 import shlex
 import shutil
@@ -17,6 +18,7 @@ from tiny_person import Run
 
 from twofold import cli
 from twofold.cli import main
+from twofold.metrics import perceptual
 from twofold.train.run import read_checkpoint
 
 
@@ -254,6 +256,47 @@ def test_a_full_disk_ends_filming_and_leaves_nothing(tmp_path: Path, capsys: pyt
         said = refused(capsys, "studio", tmp_path / "mine", "--size", 32, "--frames", 4, "--cameras", 1)
     assert f"Cannot write {tmp_path / 'mine'}" in said
     assert list(tmp_path.iterdir()) == []
+
+
+def write_small_lpips(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both files of LPIPS for a network of few channels, and makes that the one that is looked for."""
+    blocks = ((4, 4), (4, 4), (6, 6, 6), (6, 6, 6), (6, 6, 6))
+    monkeypatch.setattr(perceptual, "_BLOCKS", blocks)
+    monkeypatch.setattr(perceptual, "LPIPS", functools.partial(perceptual.LPIPS, blocks))
+    monkeypatch.setenv("TWOFOLD_WEIGHTS", str(folder))
+    vgg, inputs = {}, 3
+    for name, outputs in zip(perceptual._torchvision_names(), [c for block in blocks for c in block], strict=True):
+        vgg |= {f"{name}.weight": torch.rand(outputs, inputs, 3, 3), f"{name}.bias": torch.rand(outputs)}
+        inputs = outputs
+    folder.mkdir()
+    torch.save(vgg, folder / perceptual.VGG_FILE)  # noqa: TID251
+    linear = {f"lin{i}.model.1.weight": torch.rand(1, block[-1], 1, 1) for i, block in enumerate(blocks)}
+    torch.save(linear, folder / perceptual.LINEAR_FILE)  # noqa: TID251
+
+
+def test_perceptual_weights_shape_the_training_but_are_not_stored_with_it(
+    person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = [
+        "method.field.width=72", "method.field.high_sdf_depth=4", "method.field.high_color_depth=2",
+        "method.sampler.step=0.03", "method.losses.lpips_start=0", "method.losses.eikonal_points=16",
+        "training.steps=2", "training.pixels.rays=16", "training.pixels.patches=1", "training.pixels.patch_size=16",
+    ]  # fmt: skip
+    train = ["train", str(person_folder), "--recipe", "fast", *(w for s in small for w in ("--set", s))]
+    monkeypatch.setenv("TWOFOLD_WEIGHTS", str(tmp_path / "nowhere"))
+    main([*train, "--out", str(tmp_path / "without")])
+    assert str(tmp_path / "nowhere") in " ".join(capsys.readouterr().err.split())
+    write_small_lpips(tmp_path / "weights", monkeypatch)
+    main([*train, "--out", str(tmp_path / "with")])
+    notes = {name: json.loads((tmp_path / name / "run.json").read_text())["notes"] for name in ("with", "without")}
+    assert notes["with"] == ["LPIPS is part of the loss."]
+    assert "LPIPS is left out" in notes["without"][0]
+    (first, _), (second, _) = (read_checkpoint(tmp_path / name) for name in ("with", "without"))
+    assert {name: tensor.shape for name, tensor in first.items()} == {n: t.shape for n, t in second.items()}
+    columns = {name: (tmp_path / name / "curves.csv").read_text().split()[0].split(",") for name in notes}
+    assert set(columns["with"]) - set(columns["without"]) == {"lpips"}
+    (tmp_path / "weights" / perceptual.VGG_FILE).unlink()
+    main(["evaluate", str(tmp_path / "with"), "--most", "1", "--meshes", "0"])
 
 
 @pytest.mark.parametrize("command", ["studio", "render"])
