@@ -21,6 +21,7 @@ from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors
 from twofold.methods.base import Avatar, Subject
+from twofold.speed import flush_denormals
 from twofold.train.curves import Curves
 from twofold.train.processes import Team, joined
 from twofold.train.run import (
@@ -140,7 +141,7 @@ def train(
             a loss that is not finite, an unwritable folder.
         KeyboardInterrupt: passed on after the state has been stored.
     """
-    torch.set_flush_denormal(True)
+    flush_denormals()
     config = recipe.training
     with (
         plain_errors(folder), joined(device) as team, asked_to_stop() as stopped, contextlib.ExitStack() as at_the_end
