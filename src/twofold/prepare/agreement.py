@@ -1,7 +1,9 @@
 """The fitted body held against every picture: objects taken out of the masks, and a record of each picture."""
 
+import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -45,6 +47,7 @@ def compare_with_pictures(
     motion: Motion,
     size: float,
     held_objects: Literal["keep", "remove"],
+    alone: bool,
     show: Callable[[float], None],
 ) -> Agreement:
     """Goes through a camera's pictures with the body that was fitted; masks with objects in them are written anew.
@@ -57,6 +60,7 @@ def compare_with_pictures(
         motion: settled, in the camera's world.
         size: of the person in the pictures, pixels.
         held_objects: "remove" takes balls and the like out of the masks and marks what they hide.
+        alone: no other camera saw the person.
         show: told the share that is done.
     """
     posed = pose_motion(body, motion)
@@ -72,17 +76,15 @@ def compare_with_pictures(
         return see_body(pixels.numpy(), depth.numpy(), faces, focal, camera.height, camera.width)
 
     usual = _usual(watched, see) if held_objects == "remove" else None
-    qualities: list[PictureQuality] = []
     ignored: dict[int, Path] = {}
-    for time in range(len(motion)):
+
+    def judge(time: int) -> PictureQuality:
         seen = see(time)
         mask = open_mask(watched.masks[time])
         iou = 0.0
         if seen is not None and (mask > 127).any():
             if usual is not None:
-                with Image.open(watched.images[time]) as picture:
-                    image = np.asarray(picture.convert("RGB"))
-                mask, hidden, _ = without_objects(mask, image, seen, *usual)
+                mask, hidden = _without_objects(mask, _open_image(watched.images[time]), seen, *usual)
                 if hidden.any():
                     ignored[time] = watched.masks[time].with_suffix(".ignored.png")
                     with plain_errors(watched.masks[time].parent):
@@ -92,11 +94,46 @@ def compare_with_pictures(
             counted = np.ones_like(person) if time not in ignored else open_mask(ignored[time]) == 0
             iou = float((silhouette & person & counted).sum() / max(((silhouette | person) & counted).sum(), 1))
         track = watched.track
-        qualities.append(
-            picture_quality(name, camera, time, iou, shown[time], track.pixels[time], track.visibility[time], size)
+        return picture_quality(
+            name, camera, time, iou, shown[time], track.pixels[time], track.visibility[time], size, alone
         )
-        show((time + 1) / len(motion))
+
+    qualities: list[PictureQuality] = []
+    # Painting, comparing and writing pictures leave the interpreter free most of the time.
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        for quality in pool.map(judge, range(len(motion))):
+            qualities.append(quality)
+            show(len(qualities) / len(motion))
     return Agreement(tuple(qualities), ignored)
+
+
+def _without_objects(
+    mask: UInt8[np.ndarray, "h w"],
+    image: UInt8[np.ndarray, "h w 3"],
+    seen: SeenBody,
+    usual: Float[np.ndarray, "V 3"],
+    trusted: Bool[np.ndarray, "V"],
+) -> tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """`without_objects`, looking only at the part of the picture that body and mask take up."""
+    rows, columns = (np.flatnonzero((mask > 127).any(axis)) for axis in (1, 0))
+    down, across = seen.window
+    margin = int(0.15 * seen.pixels_per_metre) + 2
+    top = max(min(down.start, int(rows[0])) - margin, 0)
+    left = max(min(across.start, int(columns[0])) - margin, 0)
+    part = (
+        slice(top, max(down.stop, int(rows[-1]) + 1) + margin),
+        slice(left, max(across.stop, int(columns[-1]) + 1) + margin),
+    )
+    moved = replace(seen, top=(seen.top[0] - top, seen.top[1] - left), pixels=seen.pixels - np.array([left, top]))
+    hidden = np.zeros(mask.shape, dtype=bool)
+    cleaned = mask.copy()
+    cleaned[part], hidden[part], _ = without_objects(mask[part], image[part], moved, usual, trusted)
+    return cleaned, hidden
+
+
+def _open_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
 
 
 def _usual(
@@ -110,9 +147,7 @@ def _usual(
         seen = see(time)
         if seen is None:
             continue
-        with Image.open(watched.images[time]) as picture:
-            image = np.asarray(picture.convert("RGB"))
-        mask = open_mask(watched.masks[time])
+        image, mask = _open_image(watched.images[time]), open_mask(watched.masks[time])
         column, row = np.where(seen.visible[:, None], seen.pixels, 0).T
         colors.append(image[row, column])
         visible.append(seen.visible & (mask[row, column] > 127))

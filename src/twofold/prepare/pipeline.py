@@ -181,7 +181,7 @@ def _judge_all(found: _Found, body: Body, config: PrepareConfig, show: Show) -> 
     for k, (name, camera) in enumerate(found.cameras.items()):
         standing = _standing(found.motion, body, camera)
         agreement = compare_with_pictures(
-            name, camera, found.watched[k], body, found.motion, standing, config.held_objects,
+            name, camera, found.watched[k], body, found.motion, standing, config.held_objects, count == 1,
             lambda done, k=k: show(0.7 + 0.28 * (k + done) / count, "judging the fit"),
         )  # fmt: skip
         require_whole(agreement.qualities, name)

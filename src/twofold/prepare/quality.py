@@ -67,6 +67,7 @@ def picture_quality(
     pixels: Float[np.ndarray, "33 2"],
     visibility: Float[np.ndarray, "33"],
     height: float,
+    alone: bool = True,
 ) -> PictureQuality:
     """The record of one picture.
 
@@ -79,6 +80,7 @@ def picture_quality(
         pixels: where the estimator saw them; NaN where it did not.
         visibility: 0..1.
         height: of the person in this camera's pictures, pixels.
+        alone: no other camera saw the person. Where one did, landmarks that are missed are the estimator's fault.
     """
     known = np.isfinite(pixels).all(-1)
     sure = known & (visibility > 0.5)
@@ -93,7 +95,7 @@ def picture_quality(
         fault = f"too little of the person is seen (visibility {mean:.2f}, at least {LEAST_VISIBILITY})"
     elif iou < LEAST_IOU:
         fault = f"the body does not cover the mask (IoU {iou:.2f}, at least {LEAST_IOU})"
-    elif percent > MOST_REPROJECTION:
+    elif alone and percent > MOST_REPROJECTION:
         fault = f"the body misses the landmarks ({percent:.1f} % of its height, at most {MOST_REPROJECTION:g} %)"
     return PictureQuality(camera_name, time, iou, error, percent, mean, cropped, fault)
 
