@@ -1,0 +1,79 @@
+"""Clips for tests, made on the spot."""
+
+import struct
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+CLIPS = Path(__file__).parents[3] / "shared" / "data" / "video"
+UPRIGHT, RIGHT, UPSIDE_DOWN, LEFT = (1, 0, 0, 1), (0, 1, -1, 0), (-1, 0, 0, -1), (0, -1, 1, 0)
+
+
+def real_clip(name: str) -> Path:
+    path = CLIPS / name
+    if not path.exists():
+        pytest.skip(f"the clip {name} is not here")
+    return path
+
+
+def corners(height: int = 48, width: int = 64) -> np.ndarray:
+    """Red at the top left, green at the top right, blue at the bottom left, black at the bottom right."""
+    image = np.zeros((height, width, 3), np.uint8)
+    image[: height // 2, : width // 2] = [255, 0, 0]
+    image[: height // 2, width // 2 :] = [0, 255, 0]
+    image[height // 2 :, : width // 2] = [0, 0, 255]
+    return image
+
+
+def grey(level: int, height: int = 48, width: int = 64) -> np.ndarray:
+    return np.full((height, width, 3), level, np.uint8)
+
+
+def write_clip(
+    path: Path, pictures: Sequence[np.ndarray], fps: int = 25, seconds: Sequence[float] | None = None,
+    pixel_aspect: str | None = None, first_to_last: bool = False,
+) -> Path:  # fmt: skip
+    """An H.264 (or MPEG-4) video; `first_to_last` puts what a reader needs first at the beginning of an MP4."""
+    codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
+    options = {"movflags": "faststart"} if first_to_last else {}
+    with av.open(str(path), "w", options=options) as file:
+        stream = file.add_stream(codec, rate=fps)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 10000)
+        stream.options = {"crf": "12"} if codec == "libx264" else {"qscale": "2"}
+        if pixel_aspect:
+            stream.codec_context.sample_aspect_ratio = Fraction(pixel_aspect)
+        for index, picture in enumerate(pictures):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p")
+            frame.pts = round(10000 * (index / fps if seconds is None else seconds[index]))
+            frame.time_base = Fraction(1, 10000)
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+    return path
+
+
+def write_sound(path: Path) -> Path:
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("aac", rate=16000)
+        for start in range(0, 16000, 1024):
+            sound = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+            sound.sample_rate, sound.pts = 16000, start
+            file.mux(stream.encode(sound))
+        file.mux(stream.encode())
+    return path
+
+
+def hold_phone(path: Path, matrix: Sequence[float]) -> Path:
+    """Writes into an MP4 how the phone was held: where a step to the right goes (a, b), where one down goes (c, d)."""
+    content = bytearray(path.read_bytes())
+    header = content.index(b"tkhd") + 4
+    place = header + (40 if content[header] == 0 else 52)
+    a, b, c, d = (round(65536 * value) for value in matrix)
+    content[place : place + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+    return path
