@@ -16,7 +16,7 @@ from disk import files_end_at
 from PIL import Image
 from tiny_person import Run
 
-from twofold import cli
+from twofold import cli, console
 from twofold.cli import main
 from twofold.metrics import perceptual
 from twofold.train.run import read_checkpoint
@@ -311,7 +311,7 @@ def test_a_place_below_a_file_cannot_be_written(
 
 
 def test_a_line_tells_of_progress_every_tenth_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    with cli._bar("Working") as show:
+    with console.bar("Working") as show:
         for step in range(41):
             show(step / 40, f"step {step}")
     lines = capsys.readouterr().err.splitlines()
@@ -325,7 +325,7 @@ def test_a_line_tells_of_slow_progress_now_and_then_and_how_long_it_will_take(
     now = 1000.0
     for clock in ("time.monotonic", "rich.console.monotonic"):
         monkeypatch.setattr(clock, lambda: now)
-    with cli._bar("Working") as show:
+    with console.bar("Working") as show:
         for step in range(100):
             show(step / 1000, "")
             now += 10

@@ -1,4 +1,4 @@
-"""The command line: `twofold studio`, `import`, `train`, `render`, `evaluate`, `demo`.
+"""The command line: `twofold studio`, `import`, `prepare`, `check`, `train`, `render`, `evaluate`, `demo`.
 
 What a command needs is imported when it runs, so that `--help` answers at once.
 """
@@ -7,18 +7,15 @@ import functools
 import os
 import shlex
 import sys
-import time
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from twofold.cli_captures import check, import_capture, prepare, studio
+from twofold.console import ALONE, at_least, bar, console, say
 from twofold.errors import TwofoldError
 
 if TYPE_CHECKING:
@@ -26,96 +23,6 @@ if TYPE_CHECKING:
 
 Parts = Literal["all", "orbit", "views", "poses", "canonical"]
 Recipes = Literal["quick", "fast", "released", "paper"]
-_alone = os.environ.get("RANK", "0") == "0"
-"""Of several processes that train together, the first one speaks for all."""
-LINE_EVERY = 30.0
-"""Seconds after which progress is told anew where standard error is no terminal, and at every tenth of the way."""
-
-
-def _console() -> Console:
-    """Where people read: standard error, as it is now."""
-    return Console(stderr=True, highlight=False, markup=False, quiet=not _alone)
-
-
-@contextmanager
-def _bar(title: str) -> Generator[Callable[[float, str], None], None, None]:
-    """A progress bar, or a line now and then where nobody watches a terminal.
-
-    The function it gives takes the share that is done and a word about it.
-    """
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
-    console = _console()
-    with Progress(
-        *columns, TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
-        console=console, refresh_per_second=4, speed_estimate_period=60, disable=not console.is_terminal,
-    ) as progress:  # fmt: skip
-        task = progress.add_task(title, total=1.0, note="")
-        told, last = 0, time.monotonic()
-
-        def show(done: float, note: str) -> None:
-            nonlocal told, last
-            progress.update(task, completed=done, note=note)
-            tenths, now = int(10 * done), time.monotonic()
-            if console.is_terminal or (tenths == told and now - last < LINE_EVERY):
-                return
-            told, last = tenths, now
-            left = progress.tasks[0].time_remaining
-            parts = [f"{100 * done:.0f} %", *([f"{timedelta(seconds=int(left))} left"] if left else []), note]
-            console.print(f"{title}: {', '.join(filter(None, parts))}", soft_wrap=True)
-
-        yield show
-
-
-def studio(
-    out: Annotated[Path, tyro.conf.Positional],
-    seed: int = 0,
-    size: int = 256,
-    frames: int = 80,
-    cameras: int = 8,
-    pose_noise: float = 0.0,
-    mask_noise: float = 0.0,
-    background: Literal["black", "textured"] = "black",
-) -> None:
-    """Makes a capture of a person who never lived, with the truth about shape and pose.
-
-    Args:
-        out: Folder to make.
-        seed: Who, wearing what, moving how.
-        size: Rows and columns of the pictures.
-        frames: Moments; the last fifth shows a motion that is not trained on.
-        cameras: In a ring around the person; the first one trains.
-        pose_noise: Error of the given poses, radians (standard deviation).
-        mask_noise: Faults of the masks, 0 to 1.
-        background: What stands behind the person.
-    """
-    from twofold.capture.studio import StudioConfig, make_studio
-
-    config = StudioConfig(seed, size, frames, cameras, pose_noise, mask_noise, background)
-    with _bar("Filming") as show:
-        make_studio(config, out, lambda done: show(done, ""))
-    _say(f"The capture is in {out}.", f"twofold train {out}")
-
-
-def import_capture(
-    source: Annotated[Path, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.Positional],
-    held_out: int = 10,
-    drop_below_iou: float = 0.0,
-    held_objects: Literal["keep", "remove"] = "remove",
-) -> None:
-    """Makes a capture folder from one that was prepared elsewhere (images, masks, capture.npz).
-
-    Args:
-        source: Folder with images/, masks/ and capture.npz.
-        out: Folder to make.
-        held_out: Of so many frames one is kept for testing.
-        drop_below_iou: Leaves out frames whose fitted body covers the mask worse than this, 0 to 1.
-        held_objects: Whether a ball or the like that sticks out of or passes in front of the body is taken out.
-    """
-    from twofold.capture.prepared import import_prepared
-
-    import_prepared(source, out, held_out, drop_below_iou, held_objects=held_objects)
-    _say(f"The capture is in {out}.", f"twofold train {out}")
 
 
 def train(
@@ -157,12 +64,13 @@ def train(
     require(validate(source), source)
     read = read_capture(source)
     try:
-        with _bar("Training") as show:
+        with bar("Training") as show:
             loop.train(
                 read, chosen, folder, where, resume is not None,
                 lambda p: show(p.step / p.steps, f"step {p.step}  loss {sum(p.losses.values()):.4f}  {p.psnr:.1f} dB"),
                 _attach_lpips,
                 lambda avatar, step: save_preview(avatar, read, folder, step),
+                lambda note: console().print(note, soft_wrap=True),
             )  # fmt: skip
     except KeyboardInterrupt:
         if not (folder / RECIPE).is_file():
@@ -171,7 +79,7 @@ def train(
         where_asked = ["--device", device] if device != "auto" else []
         words = ["twofold", "train", *moved, "--resume", str(folder), *where_asked]
         raise KeyboardInterrupt(f"The training continues with: {shlex.join(words)}") from None
-    _say(f"The avatar is in {folder}.", f"twofold render {folder}")
+    say(f"The avatar is in {folder}.", f"twofold render {folder}")
 
 
 def _new_run(
@@ -190,7 +98,7 @@ def _new_run(
 
 
 def _attach_lpips(avatar: object) -> str | None:
-    """Gives the avatar its perceptual loss where its recipe has one, or says once that it goes without."""
+    """Gives the avatar its perceptual loss where its recipe has one; tells whether it has it."""
     from twofold.methods.factorized import FactorizedAvatar
     from twofold.metrics.perceptual import load_lpips, weights_hint
 
@@ -198,10 +106,7 @@ def _attach_lpips(avatar: object) -> str | None:
         return None
     network = load_lpips()
     avatar.attach_lpips(network)
-    if network is not None:
-        return "LPIPS is part of the loss."
-    _console().print(weights_hint(), soft_wrap=True)
-    return weights_hint()
+    return weights_hint() if network is None else "LPIPS is part of the loss."
 
 
 def render(
@@ -228,13 +133,13 @@ def render(
     from twofold.outputs.gallery import render_run
     from twofold.train.run import choose_device, find_capture, load
 
-    _at_least(size=(size, 8), chunk=(chunk, 1))
+    at_least(size=(size, 8), chunk=(chunk, 1))
     avatar, _ = load(run, choose_device(device))
     read = read_capture(find_capture(run, capture))
     folder = out or run / "renders"
-    with _bar("Drawing") as show:
+    with bar("Drawing") as show:
         render_run(avatar, read, folder, what, size, chunk, lambda done: show(done, ""))
-    _say(f"The pictures are in {folder}.", f"twofold evaluate {run}")
+    say(f"The pictures are in {folder}.", f"twofold evaluate {run}")
 
 
 def evaluate(
@@ -257,7 +162,7 @@ def evaluate(
     from twofold.evaluate import evaluate as measure
     from twofold.train.run import choose_device, find_capture, load
 
-    _at_least(most=(most, 1), meshes=(meshes, 0))
+    at_least(most=(most, 1), meshes=(meshes, 0))
     avatar, _ = load(run, choose_device(device))
     read = read_capture(find_capture(run, capture))
     count = sum(min(len(read.splits.get(s, ())), most or 10**9) for s in ("novel_view", "novel_pose"))
@@ -268,14 +173,14 @@ def evaluate(
         done += 1
         show(done / max(count, 1), split)
 
-    with _bar("Measuring") as show:
+    with bar("Measuring") as show:
         metrics = measure(avatar, read, run, most, meshes, watch)
     for section, values in metrics.items():
         if isinstance(values, dict):
             numbers = {k: v for k, v in values.items() if isinstance(v, float)}
             line = f"{section}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items())
-            _console().print(line, soft_wrap=True)
-    _say(f"The figures are in {run / 'metrics.json'}.", f"twofold render {run}")
+            console().print(line, soft_wrap=True)
+    say(f"The figures are in {run / 'metrics.json'}.", f"twofold render {run}")
 
 
 def demo(out: Path = Path("demo"), seed: int = 0) -> None:
@@ -287,26 +192,17 @@ def demo(out: Path = Path("demo"), seed: int = 0) -> None:
     """
     from twofold.demo import run_demo
 
-    with _bar("Demo") as show:
+    with bar("Demo") as show:
         page = run_demo(out, seed, show)
-    _say(f"The page is {page}.", f"open {page}, or train on your own: twofold train CAPTURE")
-
-
-def _say(result: str, following: str) -> None:
-    _console().print(f"{result} Next: {following}", soft_wrap=True)
-
-
-def _at_least(**options: tuple[int | None, int]) -> None:
-    """Refuses options (value, least) that are too small."""
-    for name, (value, least) in options.items():
-        if value is not None and value < least:
-            raise TwofoldError(f"--{name} should be at least {least}; it is {value}.")
+    say(f"The page is {page}.", f"open {page}, or train on your own: twofold train CAPTURE")
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "studio": studio,
     "import": import_capture,
+    "prepare": prepare,
+    "check": check,
     "train": train,
     "render": render,
     "evaluate": evaluate,
@@ -324,7 +220,7 @@ def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the `twofold` command: exit code 0, 2 for input that cannot be used, 130 after Ctrl-C."""
+    """Entry point of the `twofold` command: exit code 0, 1 where a check fails, 2 for bad input, 130 after Ctrl-C."""
     try:
         command = tyro.extras.subcommand_cli_from_dict(
             {name: _later(command) for name, command in COMMANDS.items()}, prog="twofold", args=arguments,
@@ -335,9 +231,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tune_process()
         command()
     except TwofoldError as error:
-        print(f"twofold{'' if _alone else ', process ' + os.environ['RANK']}: {error}", file=sys.stderr)
+        print(f"twofold{'' if ALONE else ', process ' + os.environ['RANK']}: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
-        if _alone:
+        if ALONE:
             print(" ".join(["twofold: stopped.", *map(str, stop.args)]), file=sys.stderr)
         sys.exit(130)

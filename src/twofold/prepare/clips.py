@@ -34,6 +34,10 @@ class PrepareConfig:
         held_out: of so many moments one is kept for testing.
         held_objects: whether balls and the like are taken out of the masks.
         credit: whom to name when showing the pictures.
+        masks: the user's own, instead of the estimator's.
+        landmarks: likewise.
+        poses: likewise; nothing is fitted then.
+        several_people: whether a second person in view ends it.
     """
 
     fps: float | None = None
@@ -44,6 +48,10 @@ class PrepareConfig:
     held_out: int = 10
     held_objects: Literal["keep", "remove"] = "remove"
     credit: str = ""
+    masks: Path | None = None
+    landmarks: Path | None = None
+    poses: Path | None = None
+    several_people: Literal["refuse", "ignore"] = "refuse"
 
 
 @dataclass(frozen=True)
@@ -67,6 +75,23 @@ class Clip:
     camera: Camera
     lens: CalibratedCamera | None
     calibrated: CalibratedCamera | None
+
+
+def read_intrinsics(text: str | None) -> tuple[float, float, float, float] | None:
+    """fx, fy, cx, cy from "fx,fy,cx,cy".
+
+    Raises:
+        TwofoldError: that is not what it says.
+    """
+    if text is None:
+        return None
+    try:
+        fx, fy, cx, cy = (float(part) for part in text.split(","))
+    except ValueError:
+        raise TwofoldError(
+            f"--intrinsics should be four numbers fx,fy,cx,cy in pixels, such as 1050,1050,540,960; it is {text!r}."
+        ) from None
+    return fx, fy, cx, cy
 
 
 def require_options(clips: Sequence[Path], config: PrepareConfig) -> None:

@@ -8,10 +8,12 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from twofold.body.anny import anny_body
 from twofold.body.skeleton import Body
+from twofold.body.smpl import read_smpl
 from twofold.capture.folder import CaptureWriter
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors
@@ -23,6 +25,7 @@ from twofold.prepare.evidence import Evidence
 from twofold.prepare.fit import fit
 from twofold.prepare.motion import Motion, choose, pose_motion
 from twofold.prepare.observations import Estimator
+from twofold.prepare.people import People
 from twofold.prepare.quality import (
     PictureQuality,
     kept_times,
@@ -56,6 +59,14 @@ class Prepared:
     qualities: tuple[PictureQuality, ...]
     warnings: tuple[str, ...]
 
+    def summary(self) -> str:
+        """What came of it in a few words."""
+        moments = len({quality.time for quality in self.qualities})
+        return (
+            f"{len(self.kept)} of {moments} moments, silhouette IoU {self.mean('iou'):.2f}, landmarks off by "
+            f"{self.mean('reprojection'):.1f} pixels ({self.mean('reprojection_percent'):.1f} % of the body's height)."
+        )
+
     def mean(self, what: Literal["iou", "reprojection", "reprojection_percent"]) -> float:
         """Over the pictures of the moments that are kept."""
         kept = set(self.kept)
@@ -69,6 +80,7 @@ def prepare(
     estimator: Callable[[], Estimator],
     config: PrepareConfig | None = None,
     show: Show | None = None,
+    people: Callable[[Sequence[UInt8[np.ndarray, "h w 3"]]], People] | None = None,
     overwrite: bool = False,
 ) -> Prepared:
     """Makes a capture folder from one clip, or from several of the same moments by calibrated cameras.
@@ -80,6 +92,7 @@ def prepare(
         estimator: makes a new estimator for each clip.
         config: options.
         show: told the share that is done and what is being done.
+        people: counts who is in view; None to trust that it is one person.
         overwrite: a capture that lies at `out` gives way.
 
     Raises:
@@ -94,11 +107,37 @@ def prepare(
         tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.resolve().parent) as scratch,
     ):  # fmt: skip
         ready = open_clips(clips, config)
-        found = _fit_all(ready, _watch_all(ready, Path(scratch), estimator, show), body, config, show)
+        watched = _watch_all(ready, Path(scratch), estimator, show)
+        if people is not None and config.several_people == "refuse":
+            for clip, seen in zip(ready, watched, strict=True):
+                require_one_person(people(seen.sample), clip.path)
+        found = _fit_all(ready, watched, body, config, show)
         agreed = _judge_all(found, body, config, show)
         prepared = _write(writer, out, found, agreed, body, config)
     show(1.0, "done")
     return prepared
+
+
+def read_body(which: str) -> Body:
+    """The free body for "anny", else the user's own SMPL file.
+
+    Raises:
+        TwofoldError: the body cannot be read.
+    """
+    return anny_body() if which == "anny" else read_smpl(which)
+
+
+def require_one_person(people: People, clip: Path) -> None:
+    """Refuses clips of several people.
+
+    Raises:
+        TwofoldError: a second person of comparable size is in view for a good part of the clip.
+    """
+    if people.too_many:
+        raise TwofoldError(
+            f"{clip} shows several people of about the same size in {100 * people.several:.0f} % of its pictures, and "
+            "which of them is meant nobody can tell; cut the clip to one person, or take --several-people ignore."
+        )
 
 
 def _watch_all(ready: Sequence[Clip], scratch: Path, estimator: Callable[[], Estimator], show: Show) -> list[Watched]:
