@@ -1,8 +1,12 @@
-"""Settings of the process that cost nothing and pay a lot on CPUs."""
+"""Settings of the process that cost nothing and pay a lot on CPUs; and methods that run compiled for a while."""
 
+import contextlib
 import ctypes
 import os
 import sys
+from collections.abc import Generator, Sequence
+
+from twofold.errors import TwofoldError
 
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 
@@ -37,3 +41,30 @@ def tune_process() -> None:
     libc.mallopt(_M_MMAP_MAX, 0)
     libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
     libc.mallopt(_M_TOP_PAD, 64 * 2**20)
+
+
+@contextlib.contextmanager
+def compiled_methods(owner: object, names: Sequence[str]) -> Generator[bool, None, None]:
+    """While the block lasts, these methods of one object run through torch.compile; tells whether there are any.
+
+    Sizes may change from call to call; the first calls take minutes.
+
+    Raises:
+        TwofoldError: the compiler fails, most often because the machine has none for C++.
+    """
+    import torch
+
+    for name in names:
+        setattr(owner, name, torch.compile(getattr(owner, name), dynamic=True))
+    try:
+        yield bool(names)
+    except Exception as error:
+        if not type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
+            raise
+        said = str(error).strip().partition("\n")[0]
+        raise TwofoldError(
+            f"torch.compile does not work here ({said}); install a C++ compiler, or leave training.compile at never."
+        ) from error
+    finally:
+        for name in names:
+            delattr(owner, name)

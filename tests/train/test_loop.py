@@ -1,20 +1,23 @@
-"""Training repeats, resumes, survives being killed, and is the same for one process and two."""
+"""Training repeats, resumes and survives being killed."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from small_recipes import CASES
 from tiny_person import Run, tiny_recipe
 
 from twofold.capture.types import Capture
-from twofold.train.loop import train
+from twofold.train.loop import COMPILED, NOTHING_COMPILED, train
 from twofold.train.run import Recipe, read_checkpoint
 
 CPU = torch.device("cpu")
@@ -30,6 +33,7 @@ torch.set_num_threads(1)
 folder, steps, every = Path(sys.argv[2]), int(sys.argv[3]), 3
 recipe = tiny_recipe(steps, checkpoint_every=every, images_per_step=2)
 resume = (folder / "recipe.json").exists()
+print("begun", flush=True)
 train(read_capture(sys.argv[1]), recipe, folder, torch.device("cpu"), resume=resume)
 """
 
@@ -54,11 +58,12 @@ def run_script(capture: Path, folder: Path, steps: int) -> subprocess.Popen[byte
     tests = str(Path(__file__).resolve().parents[1])
     command = [sys.executable, "-c", SCRIPT, str(capture), str(folder), str(steps), tests]
     with (folder.parent / "errors.txt").open("wb") as errors:
-        return subprocess.Popen(command, env=environment, stderr=errors)
+        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=errors)
 
 
 def finish(process: "subprocess.Popen[bytes]", folder: Path) -> None:
-    assert process.wait() == 0, (folder.parent / "errors.txt").read_text()
+    process.communicate()
+    assert process.returncode == 0, (folder.parent / "errors.txt").read_text()
 
 
 @pytest.fixture(autouse=True)
@@ -98,23 +103,39 @@ def test_a_run_without_a_checkpoint_yet_resumes_from_its_start(person: Capture, 
     assert_same(state(tmp_path / "whole"), state(tmp_path / "cut"))
 
 
-def killed_and_resumed(capture: Path, folder: Path, steps: int, waits: list[float]) -> None:
-    """Kills the run after each of the waits (seconds after its folder is there), then lets it finish."""
-    for wait in waits:
-        process = run_script(capture, folder, steps)
-        while process.poll() is None and not (folder / "recipe.json").exists():
-            time.sleep(0.02)
-        time.sleep(wait)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    finish(run_script(capture, folder, steps), folder)
+def begun(process: "subprocess.Popen[bytes]", folder: Path) -> float:
+    """Waits until the process has read its capture and trains; when that was, seconds."""
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"begun\n", (folder.parent / "errors.txt").read_text()
+    return time.monotonic()
+
+
+def reached(folder: Path) -> int:
+    """The step of the folder's checkpoint, which must be whole; 0 without one."""
+    return read_checkpoint(folder)[1] if (folder / "checkpoint.safetensors").exists() else 0
 
 
 def kills(count: int, person: Capture, tmp_path: Path) -> None:
-    finish(run_script(person.folder, tmp_path / "whole", 24), tmp_path / "whole")
-    waits = np.random.default_rng(0).uniform(0, 4, count).tolist()
-    killed_and_resumed(person.folder, tmp_path / "killed", 24, waits)
-    assert_same(state(tmp_path / "whole"), state(tmp_path / "killed"))
+    """Kills a training so many times, each time at a random instant within a third of its time, and lets it finish."""
+    steps, folder = 6 * count, tmp_path / "killed"
+    process = run_script(person.folder, tmp_path / "whole", steps)
+    start = begun(process, tmp_path / "whole")
+    finish(process, tmp_path / "whole")
+    seconds, random = time.monotonic() - start, np.random.default_rng(0)
+    trail = [0]
+    for _ in range(count):
+        process = run_script(person.folder, folder, steps)
+        begun(process, folder)
+        time.sleep(random.uniform(0, seconds / 3))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        trail.append(reached(folder))
+    assert trail == sorted(trail), "a checkpoint was lost"
+    assert any(0 < step < steps for step in trail), "no kill fell into the middle of the training"
+    finish(run_script(person.folder, folder, steps), folder)
+    print(f"checkpoints after each kill: {trail} of {steps} steps")
+    assert_same(state(tmp_path / "whole"), state(folder))
+    assert not [path.name for path in folder.iterdir() if "partial" in path.name]
 
 
 def test_a_run_killed_at_random_instants_ends_with_the_same_bits(person: Capture, tmp_path: Path) -> None:
@@ -124,6 +145,63 @@ def test_a_run_killed_at_random_instants_ends_with_the_same_bits(person: Capture
 @pytest.mark.slow
 def test_a_run_killed_twenty_times_ends_with_the_same_bits(person: Capture, tmp_path: Path) -> None:
     kills(20, person, tmp_path)
+
+
+def dense(steps: int, compile: str) -> Recipe:
+    """`fast` with networks so small that a step takes milliseconds."""
+    start = CASES["fast"]
+    return replace(start, training=replace(start.training, steps=steps, images_per_step=1, compile=compile))
+
+
+@pytest.mark.parametrize(("choice", "compiled"), [("never", False), ("auto", False), ("always", True)])
+def test_networks_run_compiled_where_the_recipe_asks_for_it_and_the_run_says_so(
+    choice: str, compiled: bool, person: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted: list[object] = []
+    ran: list[str] = []
+    said: list[str] = []
+
+    def compile_(function: Callable[..., object], **options: object) -> Callable[..., object]:
+        wanted.append(options)
+        return lambda *inputs: (ran.append(function.__name__), function(*inputs))[1]
+
+    monkeypatch.setattr(torch, "compile", compile_)
+    avatar = train(person, dense(1, choice), tmp_path / "run", CPU, say=said.append)
+    assert wanted == [{"dynamic": True}] * (3 if compiled else 0)
+    assert set(ran) == ({"forward", "sdf", "distance_and_gradient"} if compiled else set())
+    assert said == json.loads((tmp_path / "run" / "run.json").read_text())["notes"] == [COMPILED] * compiled
+    assert not {"forward", "sdf"} & set(vars(avatar.field))
+
+
+def test_feature_grids_have_nothing_to_compile_and_the_run_says_so(
+    person: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "compile", None)
+    said: list[str] = []
+    train(person, recipe_of(1, compile="always"), tmp_path / "run", CPU, say=said.append)
+    assert said == [NOTHING_COMPILED]
+
+
+COMPILING = """
+import sys, torch
+from pathlib import Path
+sys.path.insert(0, sys.argv[3])
+from train.test_loop import dense
+from twofold.capture.folder import read_capture
+from twofold.train.loop import train
+for choice in ("never", "always"):
+    train(read_capture(sys.argv[1]), dense(4, choice), Path(sys.argv[2]) / choice, torch.device("cpu"))
+"""
+
+
+@pytest.mark.slow
+def test_compiled_networks_learn_what_plain_ones_do(person: Capture, tmp_path: Path) -> None:
+    """In a process of its own, since a compiler cannot look into functions whose shapes are being checked."""
+    tests = str(Path(__file__).resolve().parents[1])
+    command = [sys.executable, "-c", COMPILING, str(person.folder), str(tmp_path), tests]
+    subprocess.run(command, check=True)
+    plain, compiled = (state(tmp_path / choice) for choice in ("never", "always"))
+    assert_same(plain, compiled, 1e-4)
 
 
 def test_training_lowers_the_loss(trained: Run) -> None:

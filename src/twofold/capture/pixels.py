@@ -50,6 +50,11 @@ class Batch:
     singles: int
     patch_pixels: Int[Tensor, "patches P P"]
 
+    def patches(self, color: Float[Tensor, "R 3"]) -> Float[Tensor, "patches 3 P P"]:
+        """The patches as pictures, from colours along the rays; pixels without a ray are black."""
+        padded = torch.cat([color, torch.zeros_like(color[:1])])
+        return padded[self.patch_pixels].permute(0, 3, 1, 2)
+
 
 @dataclass(frozen=True)
 class _Picture:

@@ -1,6 +1,7 @@
 """What every method promises: an avatar that can be posed, rendered, trained and turned into a surface."""
 
 from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -158,6 +159,10 @@ class Avatar(nn.Module, ABC):
     @abstractmethod
     def before_step(self, step: int) -> None:
         """Called before each training step."""
+
+    def compiled(self) -> AbstractContextManager[bool]:
+        """While the block lasts, what a compiler can make faster runs compiled; tells whether there is anything."""
+        return nullcontext(False)
 
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,7 +18,7 @@ from twofold.capture.pixels import Batch
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.deform.shell import Shell, build_shell, nearest_listed, sample_shell
 from twofold.deform.skinning import neighbour_weights, to_canonical, vertex_transforms
-from twofold.field.factorized import FactorizedFieldConfig
+from twofold.field.factorized import FactorizedField, FactorizedFieldConfig
 from twofold.field.factorized_grid import GridFieldConfig
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays, clip_to_box
@@ -25,6 +26,7 @@ from twofold.geometry.samples import Samples
 from twofold.geometry.trees import search_tree
 from twofold.methods.base import Avatar, PosedAvatar, Rendering, Subject
 from twofold.metrics.perceptual import LPIPS
+from twofold.speed import compiled_methods
 from twofold.volume.rendering import composite, composite_weights, laplace_density, seen_samples
 from twofold.volume.samplers import ErrorBoundedSampler
 
@@ -181,6 +183,11 @@ class FactorizedAvatar(Avatar):
             return self.raw_beta.abs() + self.config.beta_floor
         return F.softplus(self.raw_beta / _BETA_UNIT) * _BETA_UNIT + self.config.beta_floor
 
+    def compiled(self) -> AbstractContextManager[bool]:
+        """See `Avatar.compiled`. Feature grids have compiled loops of their own."""
+        dense = isinstance(self.field, FactorizedField)
+        return compiled_methods(self.field, ("forward", "sdf", "distance_and_gradient") if dense else ())
+
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The field's groups, "beta" and "pose"."""
         pose = [p for p in self.refinement.parameters() if p.requires_grad]
@@ -200,12 +207,9 @@ class FactorizedAvatar(Avatar):
         self._shells.clear()
 
     def pose(
-        self,
-        pose: Float[Tensor, "24 3"],
-        translation: Float[Tensor, "3"],
-        time: int | None = None,
+        self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], time: int | None = None,
         step: int | None = None,
-    ) -> PosedAvatar:
+    ) -> PosedAvatar:  # fmt: skip
         """See `Avatar.pose`. While training, a moment's shell is reused until the next refresh."""
         pose, translation = pose.to(self.device), translation.to(self.device)
         training = step is not None
@@ -359,7 +363,9 @@ class FactorizedAvatar(Avatar):
             singles = slice(0, batch.singles)
             terms["s3im"] = losses.s3im(rendering.color[singles], batch.color[singles], generator)
         if config.lpips and self._perceptual and step >= config.lpips_start and len(batch.patch_pixels):
-            terms["lpips"] = self._perceptual[0](_patches(rendering.color, batch), _patches(batch.color, batch)).mean()
+            terms["lpips"] = self._perceptual[0](
+                *(batch.patches(color) for color in (rendering.color, batch.color))
+            ).mean()
         return {name: getattr(config, name) * term for name, term in terms.items()}
 
     def _eikonal_gradients(self, posed: PosedAvatar, generator: torch.Generator) -> Tensor:
@@ -392,9 +398,3 @@ _BETA_UNIT = 0.01
 def _hash01(step: int) -> float:
     """A fixed number in 0..1 for each step, so that a resumed run makes the same choices."""
     return ((step * 2654435761 + 12345) % 4294967296) / 4294967296
-
-
-def _patches(color: Tensor, batch: Batch) -> Tensor:
-    """Patch images [patches 3 P P]; pixels without a ray are black in both pictures."""
-    padded = torch.cat([color, torch.zeros_like(color[:1])])
-    return padded[batch.patch_pixels].permute(0, 3, 1, 2)

@@ -39,6 +39,8 @@ from twofold.train.run import (
 
 ROW_EVERY = 20
 """Steps between two rows of the curves."""
+COMPILED = "The networks are compiled (torch.compile): the first step takes minutes."
+NOTHING_COMPILED = "This recipe has no dense networks, so training.compile changes nothing."
 
 
 @dataclass(frozen=True)
@@ -118,10 +120,15 @@ def make_optimizer(avatar: Avatar, config: TrainingConfig) -> torch.optim.Optimi
     return torch.optim.Adam(groups, betas=config.adam_betas, eps=config.adam_epsilon, fused=True)
 
 
+def wants_compiling(config: TrainingConfig, device: torch.device) -> bool:
+    """Whether `config.compile` asks for compiled networks on that device."""
+    return config.compile == "always" or (config.compile == "auto" and device.type == "cuda")
+
+
 def train(
     capture: Capture, recipe: Recipe, folder: Path, device: torch.device, resume: bool = False,
     watch: Callable[[Progress], None] | None = None, before_first: Callable[[Avatar], str | None] | None = None,
-    preview: Callable[[Avatar, int], None] | None = None,
+    preview: Callable[[Avatar, int], None] | None = None, say: Callable[[str], None] | None = None,
 ) -> Avatar:  # fmt: skip
     """Trains an avatar and leaves it in `folder`.
 
@@ -135,6 +142,7 @@ def train(
         before_first: called with the new avatar, to attach what is no part of a recipe (perceptual networks); what it
             has to say is noted in the run.
         preview: called with the avatar and the steps done, from time to time.
+        say: called with each note before the first step.
 
     Raises:
         TwofoldError: unusable settings, a checkpoint that does not fit, another capture than the run was begun with,
@@ -155,9 +163,15 @@ def train(
         if not resume and team.leads:
             require_free(folder)
         avatar = recipe.method.build(subject, recipe.seed).to(device)
-        note = before_first(avatar) if before_first else None
+        first = before_first(avatar) if before_first else None
+        notes = [first] if first else []
+        if wants_compiling(config, device):
+            notes.append(COMPILED if at_the_end.enter_context(avatar.compiled()) else NOTHING_COMPILED)
+        if say and team.leads:
+            for note in notes:
+                say(note)
         if not resume and team.leads:
-            start_folder(folder, recipe, subject, capture.folder, (note,) if note else ())
+            start_folder(folder, recipe, subject, capture.folder, tuple(notes))
         optimizer = make_optimizer(avatar, config)
         start = _restore(folder, avatar, optimizer) if resume else 0
         margin = getattr(recipe.method.sampler, "radius", 0.3) + 0.02

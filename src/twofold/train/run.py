@@ -8,6 +8,7 @@ import sys
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import Literal
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -56,6 +57,8 @@ class TrainingConfig:
     checkpoint_every: int = 500
     preview_every: int = 1000
     """Steps between two preview pictures; 0 for none."""
+    compile: Literal["never", "auto", "always"] = "never"
+    """Whether dense networks run compiled (torch.compile): "auto" on a GPU only. The first step then takes minutes."""
 
     def __post_init__(self) -> None:
         """Refuses numbers with which nothing can be trained."""
