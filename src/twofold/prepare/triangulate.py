@@ -74,7 +74,9 @@ def triangulate(
     Raises:
         TwofoldError: there are fewer than two views, or their lengths differ.
     """
-    seen = _gather(cameras, tracks, noise)
+    everything = _gather(cameras, tracks, noise)
+    known = (everything.weights > 0).sum(0) >= 2
+    seen = replace(everything, pixels=everything.pixels[:, known], weights=everything.weights[:, known])
     points = _start(seen)
     for _ in range(10):
         points = points + _step(seen, points)
@@ -83,17 +85,23 @@ def triangulate(
     among = replace(seen, weights=np.where(agree | (agree.sum(0) < 2), seen.weights, 0))
     for _ in range(5):
         points = points + _step(among, points)
-    shape = tracks[0].pixels.shape[:2]
     errors, agree = _errors(seen, points)[0], _agreeing(seen, points)
-    known = (seen.weights > 0).sum(0) >= 2
-    shown, views = (seen.weights > 0) & known, agree.sum(0)
     with np.errstate(invalid="ignore"):
-        residual = np.sqrt((np.where(agree, errors, 0) ** 2).sum(0) / views)
+        residual = np.sqrt((np.where(agree, errors, 0) ** 2).sum(0) / agree.sum(0))
+    shape = tracks[0].pixels.shape[:2]
+
+    def all_of(values: np.ndarray, otherwise: float) -> np.ndarray:
+        """Values of known points among those of all, points first."""
+        spread = np.full((len(known), *values.shape[1:]), otherwise, dtype=values.dtype)
+        spread[known] = values
+        return spread.reshape(*shape, *values.shape[1:])
+
+    in_views = np.where(seen.weights > 0, errors, np.nan)
     return Triangulation(
-        np.where(known[:, None], points, np.nan).reshape(*shape, 3),
-        residual.reshape(shape),
-        views.reshape(shape),
-        np.where(shown, errors, np.nan).reshape(-1, *shape),
+        all_of(points, np.nan),
+        all_of(residual, np.nan),
+        all_of(agree.sum(0), 0),
+        np.moveaxis(all_of(in_views.T, np.nan), -1, 0),
     )
 
 
