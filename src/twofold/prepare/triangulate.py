@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from scipy.spatial.transform import Rotation
 
 from twofold.errors import TwofoldError
@@ -88,21 +88,21 @@ def triangulate(
     errors, agree = _errors(seen, points)[0], _agreeing(seen, points)
     with np.errstate(invalid="ignore"):
         residual = np.sqrt((np.where(agree, errors, 0) ** 2).sum(0) / agree.sum(0))
-    shape = tracks[0].pixels.shape[:2]
-
-    def all_of(values: np.ndarray, otherwise: float) -> np.ndarray:
-        """Values of known points among those of all, points first."""
-        spread = np.full((len(known), *values.shape[1:]), otherwise, dtype=values.dtype)
-        spread[known] = values
-        return spread.reshape(*shape, *values.shape[1:])
-
     in_views = np.where(seen.weights > 0, errors, np.nan)
+    shape = tracks[0].pixels.shape[:2]
     return Triangulation(
-        all_of(points, np.nan),
-        all_of(residual, np.nan),
-        all_of(agree.sum(0), 0),
-        np.moveaxis(all_of(in_views.T, np.nan), -1, 0),
+        _among_all(points, known).reshape(*shape, 3),
+        _among_all(residual, known).reshape(shape),
+        np.nan_to_num(_among_all(agree.sum(0), known)).astype(np.int64).reshape(shape),
+        np.stack([_among_all(view, known) for view in in_views]).reshape(-1, *shape),
     )
+
+
+def _among_all(values: Shaped[np.ndarray, "n *s"], known: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m *s"]:
+    """Values of the known ones of m, NaN between them."""
+    spread = np.full((len(known), *values.shape[1:]), np.nan)
+    spread[known] = values
+    return spread
 
 
 def turn_cameras(
