@@ -16,9 +16,11 @@ from disk import files_end_at
 from PIL import Image
 from tiny_person import Run
 
-from twofold import cli, console
+from twofold import console
 from twofold.cli import main
+from twofold.config import with_overrides
 from twofold.metrics import perceptual
+from twofold.recipes import RECIPES
 from twofold.train.run import read_checkpoint
 
 
@@ -332,3 +334,13 @@ def test_a_line_tells_of_slow_progress_now_and_then_and_how_long_it_will_take(
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 33
     assert lines[-1].startswith("Working: 10 %, 2:30:")
+
+
+def test_the_settings_of_a_recipe_are_shown_and_each_can_be_set(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["train", "--recipe", "fast", "--settings", "--set", "training.steps=7"])
+    shown = [line.split("  ")[0].strip() for line in capsys.readouterr().out.splitlines()]
+    keys = [line.partition(" = ")[0] for line in shown]
+    assert "training.steps = 7" in shown
+    assert {"method.field.width", "method.sampler.radius", "training.compile", "seed"} <= {*keys}
+    same = with_overrides(RECIPES["fast"](), [line.replace(" = ", "=", 1) for line in shown])
+    assert same == with_overrides(RECIPES["fast"](), ["training.steps=7"])

@@ -33,6 +33,7 @@ def train(
     seed: int = 0,
     device: str = "auto",
     resume: Path | None = None,
+    settings: bool = False,
 ) -> None:
     """Trains an avatar from a capture folder.
 
@@ -44,7 +45,11 @@ def train(
         seed: Of everything random.
         device: auto, cpu, cuda or cuda:N.
         resume: Run folder of an interrupted training to continue.
+        settings: Shows every setting that --set can change, as the recipe has it, and does nothing else.
     """
+    if settings:
+        _show_settings(recipe, set, seed)
+        return
     from twofold.capture.folder import read_capture
     from twofold.capture.validate import require, validate
     from twofold.outputs.gallery import save_preview
@@ -80,6 +85,14 @@ def train(
         words = ["twofold", "train", *moved, "--resume", str(folder), *where_asked]
         raise KeyboardInterrupt(f"The training continues with: {shlex.join(words)}") from None
     say(f"The avatar is in {folder}.", f"twofold render {folder}")
+
+
+def _show_settings(recipe: Recipes, overrides: tuple[str, ...], seed: int) -> None:
+    """Every setting on a line of standard output."""
+    from twofold.config import describe, with_overrides
+    from twofold.recipes import RECIPES
+
+    print("\n".join(describe(with_overrides(replace(RECIPES[recipe](), seed=seed), overrides))))
 
 
 def _new_run(
