@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from twofold.capture.types import Capture, Frame
+from twofold.deform.pose_refinement import PoseRefinement
 from twofold.files import write_json
 from twofold.methods.base import Avatar, PosedAvatar
 from twofold.metrics import image as image_metrics
@@ -31,10 +32,47 @@ def truth(frame: Frame, background: tuple[float, float, float]) -> tuple[Tensor,
     return frame.image() * mask[..., None] + torch.tensor(background) * (1 - mask[..., None]), mask
 
 
+NEAR = 0.5
+"""Seconds over which the errors of an estimator's poses last."""
+
+
 def draw_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) -> Picture:
-    """The avatar in a frame's pose from its camera; `refined` applies what was learned about that moment's pose."""
-    posed = avatar.pose(frame.pose, frame.translation, frame.time if refined else None)
+    """The avatar in a frame's pose from its camera; `refined` applies what was learned about poses at that time."""
+    posed = pose_at(avatar, capture, frame) if refined else avatar.pose(frame.pose, frame.translation, None)
     return draw(avatar, posed, frame.camera, torch.tensor(capture.background))
+
+
+_REFINED = (
+    "as refined in training from the training pictures; a moment between two that were trained on takes the mean of "
+    "their corrections, nothing of its own picture"
+)
+
+
+def _refines(avatar: Avatar) -> bool:
+    refinement = getattr(avatar, "refinement", None)
+    return isinstance(refinement, PoseRefinement) and bool(refinement.parts)
+
+
+def pose_at(avatar: Avatar, capture: Capture, frame: Frame) -> PosedAvatar:
+    """The avatar in a frame's pose, with what training learned about the errors of the capture's poses.
+
+    A moment that was trained on has a correction of its own. Another one between two of these takes theirs, mixed, if
+    they are no more than `NEAR` seconds apart. All others stay as the capture has them.
+    """
+    refinement = getattr(avatar, "refinement", None)
+    if not isinstance(refinement, PoseRefinement) or not refinement.parts or frame.time in refinement.rows:
+        return avatar.pose(frame.pose, frame.translation, frame.time)
+    known = {f.time: f for f in capture.train}
+    before = max((t for t in known if t < frame.time), default=None)
+    after = min((t for t in known if t > frame.time), default=None)
+    if before is None or after is None or (after - before) / capture.fps > NEAR:
+        return avatar.pose(frame.pose, frame.translation, None)
+    neighbours = tuple((t, known[t].pose, known[t].translation) for t in (before, after))
+    on = refinement.root.device
+    with torch.no_grad():
+        neighbours = tuple((t, pose.to(on), place.to(on)) for t, pose, place in neighbours)
+        pose, translation = refinement.between(neighbours, frame.time, frame.pose.to(on), frame.translation.to(on))
+    return avatar.pose(pose, translation, None)
 
 
 def measure_split(
@@ -48,7 +86,7 @@ def measure_split(
         capture: with the true pictures.
         split: "train", "novel_view" or "novel_pose".
         most: at most so many frames, evenly spread; None for all.
-        refined: use the poses as refined in training where a moment was trained on.
+        refined: apply what training learned about the poses (`pose_at`).
         watch: called with every frame and its rendering.
     """
     rows, shares = [], []
@@ -64,7 +102,7 @@ def measure_split(
     if not rows:
         return {}
     means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-    poses = "as refined in training" if refined else "as the capture gives them"
+    poses = _REFINED if refined and _refines(avatar) else "as the capture gives them"
     times = len({frame.time for frame in frames})
     cameras = len({frame.camera_name for frame in frames})
     protocol = {
@@ -131,7 +169,7 @@ def evaluate(
     metrics: dict[str, object] = {}
     for split in ("novel_view", "novel_pose"):
         part = measure_split(
-            avatar, capture, split, most, watch=(lambda f, p, s=split: watch(s, f, p)) if watch else None
+            avatar, capture, split, most, True, (lambda f, p, s=split: watch(s, f, p)) if watch else None
         )
         if part:
             metrics[split] = part

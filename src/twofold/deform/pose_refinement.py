@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+
 
 class PoseRefinement(nn.Module):
     """One correction a training moment (root, body, translation) and one for the shape; all start at zero.
@@ -30,6 +32,35 @@ class PoseRefinement(nn.Module):
         if row is None or not self.parts:
             return pose, translation
         return pose + torch.cat([self.root[row], self.body[row]]), translation + self.translation[row]
+
+    def between(
+        self,
+        neighbours: tuple[tuple[int, Float[Tensor, "24 3"], Float[Tensor, "3"]], ...],
+        time: int,
+        pose: Float[Tensor, "24 3"],
+        translation: Float[Tensor, "3"],
+    ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
+        """A moment that was not trained on, corrected by what its neighbours in time were corrected by.
+
+        An estimator's errors last longer than a moment. Nothing of the moment's own picture is used.
+
+        Args:
+            neighbours: the moments before and after it that were trained on, each with its pose and translation as
+                given.
+            time: the moment between them.
+            pose: as given, radians.
+            translation: as given, metres.
+        """
+        (before, *_), (after, *_) = neighbours
+        share = (time - before) / (after - before)
+        turn, shift = torch.zeros_like(pose), torch.zeros_like(translation)
+        for weight, (known, given, place) in zip((1 - share, share), neighbours, strict=True):
+            better, moved = self(known, given, place)
+            # As rotations: axis-angle numbers jump where a body faces away.
+            change = axis_angle_to_matrix(better) @ axis_angle_to_matrix(given).transpose(-1, -2)
+            turn, shift = turn + weight * matrix_to_axis_angle(change), shift + weight * (moved - place)
+        turned = matrix_to_axis_angle(axis_angle_to_matrix(turn) @ axis_angle_to_matrix(pose))
+        return turned, translation + shift
 
     def change(self) -> dict[str, float]:
         """Root-mean-square size of the corrections: radians for the rotations, metres for the translation."""
