@@ -35,6 +35,8 @@ class Shell:
 class Field:
     branches: Literal["both", "low", "high"] = "both"
     octaves: Literal[5, 10] = 5
+    """how many octaves are seen,
+    whichever branch it is."""
     sizes: tuple[int, ...] = (16, 32)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -205,6 +207,8 @@ def test_description_lists_every_setting_with_its_documentation() -> None:
         "data", "seed", "fast", "field.branches", "field.octaves", "field.sizes", "field.background",
         "sampler.count", "extra", "note", "stages",
     ]  # fmt: skip
-    assert lines[0].endswith("where the capture lies,")
+    assert lines[0].endswith("where the capture lies, in a folder.")
     assert lines[1].endswith("of everything random.")
     assert lines[7].endswith("samples a ray.")
+    assert lines[4].endswith("how many octaves are seen, whichever branch it is.")
+    assert lines[3].endswith("field.branches = both")

@@ -92,7 +92,11 @@ def _show_settings(recipe: Recipes, overrides: tuple[str, ...], seed: int) -> No
     from twofold.config import describe, with_overrides
     from twofold.recipes import RECIPES
 
-    print("\n".join(describe(with_overrides(replace(RECIPES[recipe](), seed=seed), overrides))))
+    lines = describe(with_overrides(replace(RECIPES[recipe](), seed=seed), overrides))
+    try:
+        print("\n".join(lines), flush=True)
+    except BrokenPipeError:  # whoever reads, `head` say, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _new_run(

@@ -4,12 +4,16 @@ A configuration may hold None, booleans, numbers, text, paths, `Literal`s, tuple
 these. Where a field may be one of several dataclasses, the stored dictionary names its class under the key "kind".
 """
 
+import ast
 import contextlib
 import dataclasses
 import difflib
+import functools
 import inspect
+import itertools
 import math
 import re
+import textwrap
 import types
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -77,7 +81,7 @@ def with_overrides(config: T, overrides: Sequence[str]) -> T:
 
 
 def describe(config: object) -> list[str]:
-    """One line `key = value` for every setting, with the first line of its documentation where there is one."""
+    """One line `key = value` for every setting, with its documentation where there is some."""
     rows = [(f"{key} = {_shown(value)}", text) for key, value, text in _leaves(config)]
     width = max((len(left) for left, text in rows if text), default=0)
     return [f"{left:<{width}}  {text}" if text else left for left, text in rows]
@@ -241,10 +245,17 @@ def _leaves(config: object, prefix: str = "", text: str = "") -> Iterator[tuple[
             yield prefix + f.name, value, documented.get(f.name, text)
 
 
+@functools.cache
 def _documentation(cls: type) -> dict[str, str]:
-    """First lines of the entries under "Attributes:" in a docstring."""
+    """What a docstring says under "Attributes:", or the text below a field, each as one line."""
     section = (inspect.getdoc(cls) or "").partition("Attributes:")[2]
-    return {name: line.strip() for name, line in re.findall(r"^ {4}(\w+): *(.+)$", section, re.MULTILINE)}
+    texts: dict[str, str] = dict(re.findall(r"^ {4}(\w+): *(.+(?:\n {5,}.+)*)", section, re.MULTILINE))
+    with contextlib.suppress(OSError):  # the source is not always there
+        definition = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+        for field, below in itertools.pairwise(cast(ast.ClassDef, definition).body):
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                texts[ast.unparse(field.target)] = str(ast.literal_eval(below.value))
+    return {name: " ".join(text.split()) for name, text in texts.items()}
 
 
 def _fields(config: object) -> tuple["dataclasses.Field[Any]", ...]:
