@@ -1,7 +1,7 @@
 """A video, or a folder of pictures, as upright pictures at even steps of time."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar, final
@@ -151,18 +151,60 @@ def natural_order(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def picture_files(folder: Path) -> tuple[Path, ...]:
-    """The pictures in a folder in natural order; hidden files are none.
+    """The pictures in a folder in natural order.
 
     Raises:
         TwofoldError: there is none.
     """
+    return files_with(folder, PICTURE_ENDINGS, "pictures; expected PNG or JPEG files, one for each frame")
+
+
+def files_with(folder: Path, endings: tuple[str, ...], what: str) -> tuple[Path, ...]:
+    """Files of some kinds in natural order; hidden ones are left out.
+
+    Raises:
+        TwofoldError: there is none ("holds no" `what`), or the folder cannot be read.
+    """
     try:
-        found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURE_ENDINGS and not p.name.startswith(".")]
+        found = [p for p in folder.iterdir() if p.suffix.lower() in endings and not p.name.startswith(".")]
     except OSError as error:
         raise TwofoldError(f"The folder {folder} cannot be read ({error.strerror}); check its permissions.") from error
     if not found:
-        raise TwofoldError(f"The folder {folder} holds no pictures; expected PNG or JPEG files, one for each frame.")
+        raise TwofoldError(f"The folder {folder} holds no {what}.")
     return tuple(sorted(found, key=lambda path: natural_order(path.name)))
+
+
+def files_by_picture(files: Sequence[Path], info: ClipInfo, what: str) -> dict[int, Path]:
+    """Which picture of a clip each file belongs to, counted as `Picture.source` is.
+
+    By name, if the clip is a folder whose pictures are called the same; else by the last number in the name, counted
+    from 0 or 1; else, where there are no such numbers or they are too large, in natural order, one for each picture.
+
+    Args:
+        files: in natural order, all of one folder.
+        info: the clip.
+        what: they are, for the sentences: "masks".
+
+    Raises:
+        TwofoldError: they belong to no picture, or there is another number of them.
+    """
+    places = {name: place for place, name in enumerate(info.names)}
+    if len(places) == len(info.names) and all(path.stem in places for path in files):
+        return {places[path.stem]: path for path in files}
+    slack = max(1, info.sources // 50)  # What a video says of its length is not always right.
+    last_numbers = [re.findall(r"[0-9]+", path.stem)[-1:] for path in files]
+    numbers = [int(found[0]) for found in last_numbers if found]
+    if len(set(numbers)) == len(files):
+        from_one = min(numbers) == 1 or (min(numbers) > 1 and max(numbers) >= info.sources)
+        if max(numbers) - from_one < info.sources + slack:
+            return {number - from_one: path for number, path in zip(numbers, files, strict=True)}
+    if abs(len(files) - info.sources) <= slack:
+        return dict(enumerate(files))
+    numbered = f", numbered from {min(numbers)} to {max(numbers)}" if len(set(numbers)) == len(files) else ""
+    raise TwofoldError(
+        f"{files[0].parent} holds {len(files)} {what}{numbered}, and the clip has {info.sources} pictures; number them "
+        "as its pictures are, from 0, or give one for each."
+    )
 
 
 def picture_size(path: Path) -> tuple[int, int]:
