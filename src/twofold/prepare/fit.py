@@ -82,7 +82,26 @@ def fit(
     Raises:
         TwofoldError: nobody was found at any moment.
     """
-    config, watch = config or FitConfig(), watch or (lambda done: None)
+    threads = torch.get_num_threads()
+    # Thousands of small operations: sharing them out costs more than it saves.
+    torch.set_num_threads(1)
+    try:
+        return _fit(
+            body, evidence, fps, free_focal, config or FitConfig(), points_in_space, watch or (lambda done: None)
+        )
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _fit(
+    body: Body,
+    evidence: Sequence[Evidence],
+    fps: float,
+    free_focal: bool,
+    config: FitConfig,
+    points_in_space: Float[np.ndarray, "t 33 3"] | None,
+    watch: Callable[[float], None],
+) -> Motion:
     moments = len(evidence[0].track)
     if not np.any([e.track.found for e in evidence]):
         raise TwofoldError("Nobody was found in any picture; film one whole person, well lit, and try again.")

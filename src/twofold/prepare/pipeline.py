@@ -19,12 +19,15 @@ from twofold.errors import TwofoldError
 from twofold.files import plain_errors
 from twofold.geometry.cameras import Camera
 from twofold.prepare.agreement import Agreement, compare_with_pictures
-from twofold.prepare.calibration import pinhole, undistorter
+from twofold.prepare.calibration import pinhole, undistort, undistorter
 from twofold.prepare.clips import Clip, PrepareConfig, longer, open_clips, require_options
 from twofold.prepare.evidence import Evidence
 from twofold.prepare.fit import fit
+from twofold.prepare.given_landmarks import landmarks_from_file, track_at
+from twofold.prepare.given_masks import masks_from_folder
+from twofold.prepare.given_poses import poses_from_file
 from twofold.prepare.motion import Motion, choose, pose_motion
-from twofold.prepare.observations import Estimator
+from twofold.prepare.observations import Estimator, Track
 from twofold.prepare.people import People
 from twofold.prepare.quality import (
     PictureQuality,
@@ -107,7 +110,7 @@ def prepare(
         tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.resolve().parent) as scratch,
     ):  # fmt: skip
         ready = open_clips(clips, config)
-        watched = _watch_all(ready, Path(scratch), estimator, show)
+        watched = _watch_all(ready, Path(scratch), estimator, config, show)
         if people is not None and config.several_people == "refuse":
             for clip, seen in zip(ready, watched, strict=True):
                 require_one_person(people(seen.sample), clip.path)
@@ -140,20 +143,24 @@ def require_one_person(people: People, clip: Path) -> None:
         )
 
 
-def _watch_all(ready: Sequence[Clip], scratch: Path, estimator: Callable[[], Estimator], show: Show) -> list[Watched]:
+def _watch_all(
+    ready: Sequence[Clip], scratch: Path, estimator: Callable[[], Estimator], config: PrepareConfig, show: Show
+) -> list[Watched]:
     watched: list[Watched] = []
     for k, clip in enumerate(ready):
+        own = None if config.masks is None else masks_from_folder(_piece(config.masks, clip, len(ready)), clip.info)
         straighten = None if clip.lens is None else undistorter(clip.lens, clip.info.height, clip.info.width)
         finder = estimator()
         try:
             seen = watch_clip(
-                clip.frames, clip.info.frames, finder, scratch / clip.name, straighten,
+                clip.frames, clip.info.frames, finder, scratch / clip.name, straighten, own,
                 lambda done, k=k: show(0.3 * (k + done) / len(ready), "looking at the pictures"),
             )  # fmt: skip
         finally:
             finder.close()
         require_length(len(seen.images), str(clip.path))
-        require_person(seen.track, str(clip.path))
+        if config.landmarks is None:
+            require_person(seen.track, str(clip.path))
         watched.append(seen)
     moments = min(len(seen.images) for seen in watched)
     # Synchronised clips end a picture or two apart.
@@ -177,6 +184,7 @@ class _Found:
     fps: float
     swapped: dict[str, list[int]]
     calibrated: bool
+    remarks: list[str]
 
 
 def _fit_all(
@@ -188,30 +196,58 @@ def _fit_all(
     calibrated = [clip.calibrated for clip in ready if clip.calibrated is not None]
     cameras = [clip.camera for clip in ready]
     in_space: Float[np.ndarray, "t 33 3"] | None = None
+    own = [_own_landmarks(clip, seen, config, len(ready)) for clip, seen in zip(ready, watched, strict=True)]
     show(0.3, "telling left from right")
     if len(tracks) > 1:
         repairs = repair_with_views(tracks, calibrated, seconds)
-        tracks = [repair.track for repair in repairs]
+        tracks = [o or repair.track for o, repair in zip(own, repairs, strict=True)]
         calibrated = turn_cameras(calibrated, tracks)
         cameras = [pinhole(c, clip.info.height, clip.info.width) for c, clip in zip(calibrated, ready, strict=True)]
         in_space = triangulate(calibrated, tracks).points.astype(np.float32)
     else:
         repairs = [repair_swaps(tracks[0], seconds)]
-        tracks = [repairs[0].track]
+        tracks = [own[0] or repairs[0].track]
     evidence = [
         Evidence(camera, track, seen.masks) for camera, track, seen in zip(cameras, tracks, watched, strict=True)
     ]
     free = config.intrinsics is None and config.calibration is None
-    motion = fit(
-        body, evidence, fps, free, points_in_space=in_space,
-        watch=lambda done: show(0.3 + 0.4 * done, "fitting the body"),
-    ).settled(body)  # fmt: skip
+    if config.poses is not None:
+        motion = poses_from_file(config.poses, ready[0].info, watched[0].sources, body)
+    else:
+        motion = fit(
+            body, evidence, fps, free, points_in_space=in_space,
+            watch=lambda done: show(0.3 + 0.4 * done, "fitting the body"),
+        ).settled(body)  # fmt: skip
     scaled = [longer(camera, float(motion.log_focal.exp())) for camera in cameras]
     swapped = {c.name: np.flatnonzero(r.swapped).tolist() for c, r in zip(ready, repairs, strict=True)}
     motion = replace(motion, log_focal=torch.zeros(()))
     watched = [replace(seen, track=track) for seen, track in zip(watched, tracks, strict=True)]
     cameras = {clip.name: camera for clip, camera in zip(ready, scaled, strict=True)}
-    return _Found(motion, cameras, watched, fps, swapped, config.calibration is not None)
+    remarks = [f"{clip.name}: {remark}" for clip in ready for remark in clip.frames.remarks]
+    return _Found(motion, cameras, watched, fps, swapped, config.calibration is not None, remarks)
+
+
+def _piece(place: Path, clip: Clip, clips: int) -> Path:
+    """Where the user's own pieces of a clip lie: at the place itself, or there under the clip's name."""
+    if clips == 1:
+        return place
+    found = sorted(p for p in place.iterdir() if p.stem == clip.path.stem) if place.is_dir() else []
+    if not found:
+        raise TwofoldError(f"{place} has nothing called {clip.path.stem}; with several videos, name each after its.")
+    return found[0]
+
+
+def _own_landmarks(clip: Clip, seen: Watched, config: PrepareConfig, clips: int) -> Track | None:
+    """The user's own landmarks; how they lie in space is left to the estimator."""
+    if config.landmarks is None:
+        return None
+    track = landmarks_from_file(_piece(config.landmarks, clip, clips), clip.info)
+    track = track_at(track, seen.sources)
+    require_person(track, str(config.landmarks))
+    pixels = track.pixels
+    if clip.lens is not None:
+        pixels = undistort(clip.lens, pixels.astype(np.float64)).astype(np.float32)
+    return replace(track, pixels=pixels, world=np.where(np.isfinite(track.world), track.world, seen.track.world))
 
 
 def _judge_all(found: _Found, body: Body, config: PrepareConfig, show: Show) -> list[Agreement]:
@@ -261,7 +297,7 @@ def _write(
     dropped = sorted(set(range(len(poses))) - set(kept))
     yaw = yaw_range(poses[trained], cameras[train])
     moved, width = watched[index].moved, cameras[train].width
-    warnings = warnings_about(yaw, moved, width, dropped, len(cameras) > 1)
+    warnings = [*found.remarks, *warnings_about(yaw, moved, width, dropped, len(cameras) > 1)]
     writer.finish(
         name=out.name,
         body=body,

@@ -53,6 +53,7 @@ def watch_clip(
     estimator: Estimator,
     scratch: Path,
     straighten: Straighten | None = None,
+    given: Callable[[int], UInt8[np.ndarray, "h w"] | None] | None = None,
     show: Callable[[float], None] | None = None,
 ) -> Watched:
     """Looks at every picture of a clip.
@@ -63,6 +64,7 @@ def watch_clip(
         estimator: finds the person.
         scratch: folder for the files.
         straighten: takes the lens's distortion out of a picture.
+        given: the user's own mask of a picture by its `source`, None where there is none; taken as it is.
         show: told the share that is done.
 
     Raises:
@@ -81,7 +83,10 @@ def watch_clip(
     for picture in pictures:
         image = picture.image if straighten is None else straighten(picture.image)
         found = estimator(image, picture.seconds)
-        mask = clean_mask(found.mask)
+        own = None if given is None else given(picture.source)
+        mask = clean_mask(found.mask) if own is None else own
+        if own is not None and straighten is not None:
+            mask = straighten(np.repeat(own[..., None], 3, 2))[..., 0]
         stem = f"{picture.index:06d}"
         images.append(scratch / f"{stem}.jpg")
         masks.append(scratch / f"{stem}.png")
