@@ -10,14 +10,14 @@ import torch
 
 from twofold.capture.folder import read_capture
 from twofold.capture.studio import StudioConfig, make_studio
-from twofold.capture.types import Capture, Frame
+from twofold.capture.types import Capture, Frame, spread
 from twofold.errors import TwofoldError
 from twofold.evaluate import evaluate, with_protocols
 from twofold.files import write_json
 from twofold.methods.base import Avatar
 from twofold.metrics.image import to_8bit
 from twofold.outputs.charts import Chart, Curve
-from twofold.outputs.gallery import comparison, motion_frames, orbit_frames, panels, save_png, scene_up, spread
+from twofold.outputs.gallery import comparison, motion_frames, orbit_frames, panels, save_png, scene_up
 from twofold.outputs.sheets import sheet
 from twofold.outputs.video import write_video
 from twofold.outputs.views import draw, orbit, pose_canonically

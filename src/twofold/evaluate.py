@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from twofold.capture.types import Capture, Frame
+from twofold.capture.types import Capture, Frame, spread
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.files import write_json
 from twofold.methods.base import Avatar, PosedAvatar
@@ -16,14 +16,6 @@ from twofold.metrics import image as image_metrics
 from twofold.metrics import shape as shape_metrics
 from twofold.outputs.surface import extract_surface, pose_surface
 from twofold.outputs.views import Picture, draw
-
-
-def evenly(frames: tuple[Frame, ...], most: int | None) -> tuple[Frame, ...]:
-    """At most so many of the frames, evenly spread; None for all."""
-    if most is None or len(frames) <= most:
-        return frames
-    chosen = np.linspace(0, len(frames) - 1, most).round().astype(int)
-    return tuple(frames[i] for i in chosen)
 
 
 def truth(frame: Frame, background: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
@@ -90,7 +82,7 @@ def measure_split(
         watch: called with every frame and its rendering.
     """
     rows, shares = [], []
-    frames = evenly(capture.splits.get(split, ()), most)
+    frames = spread(capture.splits.get(split, ()), most)
     for frame in frames:
         picture = draw_frame(avatar, capture, frame, refined)
         image, mask = truth(frame, capture.background)
@@ -125,9 +117,7 @@ def measure_geometry(
 ) -> dict[str, object]:
     """Means of the surface figures over the moments whose true mesh is known; empty where none is."""
     moments = {f.time: f for split in ("novel_view", "novel_pose", "train") for f in capture.splits.get(split, ())}
-    times = [time for time in sorted(capture.meshes) if time in moments]
-    if most is not None and len(times) > most:
-        times = [times[i] for i in np.linspace(0, len(times) - 1, most).round().astype(int)]
+    times = spread([time for time in sorted(capture.meshes) if time in moments], most)
     rows = []
     for time in times:
         frame = moments[time]

@@ -1,10 +1,14 @@
 """Frames read their pictures when asked."""
 
+import itertools
+
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
 from twofold.capture.folder import read_capture
+from twofold.capture.types import spread
 
 
 def test_a_frame_reads_colours_and_mask_as_shares_of_one(tiny):
@@ -51,3 +55,15 @@ def test_ignored_pixels_are_read_and_none_are_where_there_is_no_file(tiny):
     frames = read_capture(tiny).train
     assert torch.equal(frames[1].ignored(), torch.from_numpy(layer > 0))
     assert not frames[2].ignored().any()
+
+
+@pytest.mark.parametrize(
+    ("count", "most"), [(0, 3), (1, 3), (5, 2), (7, 3), (7, 7), (7, 99), (7, 1), (7, 0), (7, None)]
+)
+def test_items_are_spread_evenly_from_the_first_to_the_last(count, most):
+    chosen = spread(range(count), most)
+    assert len(chosen) == min(count, count if most is None else most)
+    if len(chosen) > 1:
+        gaps = [b - a for a, b in itertools.pairwise(chosen)]
+        assert (chosen[0], chosen[-1]) == (0, count - 1)
+        assert max(gaps) - min(gaps) <= 1

@@ -61,6 +61,13 @@ def ended(team: "list[subprocess.Popen[str]]") -> list[tuple[int, str]]:
     return [(process.returncode, text) for process, text in zip(team, said, strict=True)]
 
 
+def wait_for(path: Path, team: "list[subprocess.Popen[str]]") -> None:
+    """Until a team has made this file or folder."""
+    while not path.exists():
+        assert all(process.poll() is None for process in team), ended(team)
+        time.sleep(0.1)
+
+
 def last_losses(folder: Path) -> dict[str, float]:
     curves = Curves(folder, 10**9)
     curves.close()
@@ -89,9 +96,7 @@ def test_two_processes_learn_what_one_does(person: Capture, tmp_path: Path) -> N
 def test_a_team_stops_together_when_one_is_asked_to_and_goes_on_together(person: Capture, tmp_path: Path) -> None:
     recipe = tiny_recipe(400, images_per_step=2, checkpoint_every=1000)
     team = together(person, recipe, tmp_path / "run")
-    while not (tmp_path / "run" / "tensorboard").exists():
-        assert all(process.poll() is None for process in team), ended(team)
-        time.sleep(0.1)
+    wait_for(tmp_path / "run" / "tensorboard", team)
     time.sleep(1)
     team[1].send_signal(signal.SIGINT)
     assert [code for code, _ in ended(team)] == [130, 130]
@@ -108,9 +113,7 @@ def test_a_team_stops_together_when_one_is_asked_to_and_goes_on_together(person:
 def test_a_process_whose_partner_ends_says_so_in_one_sentence(person: Capture, tmp_path: Path) -> None:
     recipe = tiny_recipe(400, images_per_step=2, checkpoint_every=1000)
     team = together(person, recipe, tmp_path / "run")
-    while not (tmp_path / "run" / "tensorboard").exists():
-        assert all(process.poll() is None for process in team), ended(team)
-        time.sleep(0.1)
+    wait_for(tmp_path / "run" / "tensorboard", team)
     team[1].kill()
     code, said = ended(team)[0]
     assert code == 2, said

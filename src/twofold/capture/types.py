@@ -1,7 +1,9 @@
 """What a data set is to everything above it: a `Capture` of `Frame`s."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -11,6 +13,8 @@ from torch import Tensor
 
 from twofold.body.skeleton import Body
 from twofold.geometry.cameras import Camera
+
+Item = TypeVar("Item")
 
 SPLITS = ("train", "novel_view", "novel_pose")
 """Training pictures; the same moments from other cameras; other moments."""
@@ -88,3 +92,14 @@ class Capture:
     def train(self) -> tuple[Frame, ...]:
         """The training frames."""
         return self.splits["train"]
+
+
+def spread(items: Sequence[Item], most: int | None = None) -> list[Item]:
+    """At most so many items, evenly spread, the first and the last among them; None for all.
+
+    >>> spread("abcdefg", 3)
+    ['a', 'd', 'g']
+    """
+    count = len(items) if most is None else min(most, len(items))
+    chosen = np.linspace(0, len(items) - 1, count).round().astype(int)
+    return [items[i] for i in chosen.tolist()]

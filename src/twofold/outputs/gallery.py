@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from twofold.capture.types import Capture, Frame
+from twofold.capture.types import Capture, Frame, spread
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors, write_atomically
 from twofold.methods.base import Avatar, PosedAvatar
@@ -93,14 +93,6 @@ def comparison(
 def _around(mask: Float[Tensor, "h w"]) -> tuple[slice, slice]:
     """The person's box and a little room; the whole picture where nobody is."""
     return subject_box(mask, margin=6) if (mask > 0.5).any() else (slice(None), slice(None))
-
-
-def spread(frames: tuple[Frame, ...], count: int) -> list[Frame]:
-    """So many of the frames, evenly spread from the first to the last."""
-    if not frames:
-        return []
-    chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
-    return [frames[i] for i in chosen]
 
 
 def orbit_frames(

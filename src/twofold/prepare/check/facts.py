@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from torch import Tensor
 from twofold.body.skeleton import ShapedBody, shape_body
 from twofold.capture.contents import Contents, read_contents, spans
 from twofold.capture.folder import capture_of
-from twofold.capture.types import Capture, Frame
+from twofold.capture.types import Capture, Frame, spread
 from twofold.capture.validate import mesh_faults, pixel_faults, quick_faults
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import project
@@ -27,7 +26,6 @@ from twofold.prepare.check.motion import MotionFacts, motion_facts
 from twofold.prepare.check.pictures import Background, background_of, sees_a_face, shows_its_back
 from twofold.prepare.check.verdict import counted
 
-Item = TypeVar("Item")
 MOST_LOOKED_AT = 100
 """Pictures that are looked at unless more are asked for: a tenth of a second each."""
 MOST_VALIDATED = 1000
@@ -195,18 +193,6 @@ def measure_capture(
     )
     watch(1.0)
     return facts, capture
-
-
-def spread(items: Sequence[Item], most: int) -> list[Item]:
-    """At most so many items, evenly spread, the first and the last among them.
-
-    >>> spread("abcdefg", 3)
-    ['a', 'd', 'g']
-    """
-    if most <= 0 or not items:
-        return []
-    chosen = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))
-    return [items[i] for i in chosen.tolist()]
 
 
 def _usable(folder: Path) -> Contents:

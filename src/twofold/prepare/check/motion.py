@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
 from twofold.body.skeleton import JOINT_NAMES, joint_transforms
-from twofold.capture.types import Frame
+from twofold.capture.types import Frame, spread
 from twofold.geometry.rotations import axis_angle_to_matrix
 
 SLACK, ACCELERATION = 0.12, 40.0
@@ -101,7 +101,7 @@ def motion_facts(
         strays.append(stray)
     azimuths, elevations = _directions(train, rotations[:, 0], placed[:, 0])
     novel = sorted({frame.time for frame in splits.get("novel_pose", ())})
-    few = _spread(train_times, 150)
+    few = torch.tensor(spread(train_times, 150))
     apart = _apart(rotations[few], rotations[novel]).amax(-1).amin(0) if novel else torch.empty(0)
     upward = torch.nn.functional.normalize(placed[:, 12] - placed[:, 0], dim=-1)[times, 1]
     sides = sides_seen(np.radians(azimuths))
@@ -235,9 +235,3 @@ def _different(rotations: Float[Tensor, "t 24 3 3"]) -> int:
         if not kept or float(apart[moment, kept].min()) > NEW_POSE:
             kept.append(moment)
     return len(kept)
-
-
-def _spread(times: Sequence[int], most: int) -> Int[Tensor, "n"]:
-    """At most so many of these, evenly spread."""
-    chosen = np.unique(np.linspace(0, len(times) - 1, min(most, len(times))).round().astype(int))
-    return torch.tensor([times[i] for i in chosen], dtype=torch.long)

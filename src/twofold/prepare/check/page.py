@@ -13,13 +13,13 @@ from PIL import Image, ImageOps
 from scipy import ndimage
 
 from twofold.body.skeleton import ShapedBody, shape_body
-from twofold.capture.types import Capture, Frame
+from twofold.capture.types import Capture, Frame, spread
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors, write_bytes, write_json
 from twofold.page import Table, Verdict, document, embedded, header, inline, paragraphs, table_html, tiles
 from twofold.prepare.check.agreement import BAD
 from twofold.prepare.check.charts import agreement_svg, limbs_svg, sides_svg
-from twofold.prepare.check.facts import Facts, spread
+from twofold.prepare.check.facts import Facts
 from twofold.prepare.check.frames import FrameFacts, look_at, read_bytes, side_of_faces
 from twofold.prepare.check.rules import SEEN
 from twofold.prepare.check.verdict import Finding, Judgement, counted
