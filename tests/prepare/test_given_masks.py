@@ -102,6 +102,8 @@ def palette(person):
 def test_soft_edges_stay_soft(tmp_path):
     Image.fromarray(np.arange(256, dtype=np.uint8).reshape(16, 16)).save(tmp_path / "soft.png")
     assert np.array_equal(read_mask(tmp_path / "soft.png").ravel(), np.arange(256))
+    Image.fromarray(256 * np.arange(256, dtype=np.uint16).reshape(16, 16)).save(tmp_path / "deep.png")
+    assert np.array_equal(read_mask(tmp_path / "deep.png").ravel(), np.round(256 * np.arange(256) / 257))
 
 
 def test_an_empty_mask_stays_empty(tmp_path):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -42,6 +42,7 @@ class Observation:
     mask: UInt8[np.ndarray, "h w"]
 
 
+@runtime_checkable
 class Estimator(Protocol):
     """Finds one person in the pictures of a clip, which come in order."""
 

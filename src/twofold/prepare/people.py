@@ -69,7 +69,7 @@ class People:
         return self.several >= SHARE
 
 
-def count_people(images: Iterable[UInt8[np.ndarray, "h w 3"]]) -> People:
+def count_people(images: Iterable[UInt8[np.ndarray, "_ _ 3"]]) -> People:
     """Who is in view, by MediaPipe's person detector.
 
     A second person counts who is at least 0.6 times as large as the first, so that passers-by behind do not. Every
