@@ -43,14 +43,16 @@ def body_points(body: Body) -> BodyPoints:
     def on_skin(name: str, joint: str, vertex: int) -> None:
         put(name, joint, vertices[vertex], body.shape_basis[vertex])
 
-    head = body.weights[:, JOINT_NAMES.index("head")] > 0.5
-    nose = _extreme(vertices, head & (vertices[:, 0].abs() < 0.02), lambda v: v[:, 2])
+    head = _region(body, "head")
+    middle = joints[[JOINT_NAMES.index("left_shoulder"), JOINT_NAMES.index("right_shoulder")], 0].mean()
+    aside = (vertices[:, 0] - middle).abs()
+    nose = _extreme(vertices, head & (aside < aside[head].min() + 0.02), lambda v: v[:, 2])
     height = vertices[nose, 1]
     on_skin("nose", "head", nose)
     for side, sign in (("left", 1.0), ("right", -1.0)):
         for name, across, up in ((f"{side}_eye_inner", 0.018, 0.036), (f"{side}_eye", 0.032, 0.036),
                                  (f"{side}_eye_outer", 0.045, 0.034), (f"mouth_{side}", 0.025, -0.035)):  # fmt: skip
-            target = torch.stack([vertices.new_tensor(sign * across), height + up])
+            target = torch.stack([middle + sign * across, height + up])
             on_skin(name, "head", _front_of(vertices, head, target))
         level = (vertices[:, 1] - height).abs() < 0.03
         on_skin(f"{side}_ear", "head", _extreme(vertices, head & level, lambda v, s=sign: s * v[:, 0]))
@@ -63,12 +65,21 @@ def body_points(body: Body) -> BodyPoints:
             at = joints[wrist] + along * (joints[hand] - joints[wrist]) + forward * joints.new_tensor([0.0, 0.0, 1.0])
             change = body.joint_basis[wrist] + along * (body.joint_basis[hand] - body.joint_basis[wrist])
             put(f"{side}_{finger}", f"{side}_wrist", at, change)
-        ankle, toes = (JOINT_NAMES.index(f"{side}_{part}") for part in ("ankle", "foot"))
-        foot = body.weights[:, [ankle, toes]].sum(1) > 0.5
+        foot = _region(body, f"{side}_ankle", f"{side}_foot")
         sole = foot & (vertices[:, 1] < vertices[foot, 1].min() + 0.05)
         on_skin(f"{side}_heel", f"{side}_ankle", _extreme(vertices, sole, lambda v: -v[:, 2]))
         on_skin(f"{side}_foot_index", f"{side}_ankle", _extreme(vertices, sole, lambda v: v[:, 2]))
     return BodyPoints(carrier, place, basis)
+
+
+def _region(body: Body, *names: str) -> Bool[Tensor, "V"]:
+    """The vertices that follow some joints most; where a body has none, those that are nearest to them."""
+    chosen = [JOINT_NAMES.index(name) for name in names]
+    follows = body.weights[:, chosen].sum(1) > 0.5
+    if bool(follows.any()):
+        return follows
+    away = torch.cdist(body.template, body.joints)
+    return away[:, chosen].amin(1) <= torch.maximum(away.amin(1), away[:, chosen].min())
 
 
 def _extreme(vertices: Float[Tensor, "V 3"], where: Bool[Tensor, "V"], along: Callable[[Tensor], Tensor]) -> int:
