@@ -39,14 +39,14 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Seen:
-    """Evidence of all cameras as tensors, c cameras and t moments."""
+    """Evidence of all cameras as tensors, c cameras and t moments; landmarks in space are each camera's or common."""
 
     world_to_camera: Float[Tensor, "c 4 4"]
     intrinsics: Float[Tensor, "c 3 3"]
     pixels: Float[Tensor, "c t 33 2"]
     weight: Float[Tensor, "c t 33"]
-    space: Float[Tensor, "c t 33 3"]
-    space_weight: Float[Tensor, "c t 33"]
+    space: Float[Tensor, "k t 33 3"]
+    space_weight: Float[Tensor, "k t 33"]
     size: Float[Tensor, "c"]
 
 
@@ -82,17 +82,21 @@ def gather(
 
 def _height(track: Track) -> float:
     """Median over the clip of the landmarks' extent, a little less than the person's height, pixels."""
-    found = track.pixels[track.found]
-    return float(np.median(np.nanmax(np.nanmax(found, 1) - np.nanmin(found, 1), 1))) * 1.1
+    there = np.isfinite(track.pixels).all(-1)
+    found = np.flatnonzero(there.any(1))
+    if len(found) == 0:
+        return 1.0
+    extents = [np.ptp(track.pixels[time][there[time]], axis=0).max() for time in found]
+    return max(float(np.median(extents)) * 1.1, 1.0)
 
 
 def begin(body: Body, points: BodyPoints, seen: Seen) -> Motion:
     """A first guess: the mean shape, posed by the landmarks in space, standing where it projects to its landmarks."""
     where = torch.where(seen.space_weight[..., None] > 0, seen.space, torch.nan)
     guesses = [first_pose(points, one) for one in where]
-    # Each camera has a guess of its own; at each moment the one that sees most is taken.
+    # Each camera has a guess of its own; at each moment the one that sees most is taken, of those that know any.
     surest = seen.weight.sum(-1)[: len(guesses)] if len(guesses) > 1 else torch.zeros(1, len(where[0]))
-    best = surest.argmax(0)
+    best = torch.where(torch.stack([known for _, _, known in guesses]), surest, surest - 1e3).argmax(0)
     guess, pose = (torch.stack([g[part] for g in guesses])[best, torch.arange(len(best))] for part in (0, 1))
     moments = len(guess)
     motion = Motion(

@@ -93,7 +93,8 @@ def _trace(mask: UInt8[np.ndarray, "h w"]) -> tuple[np.ndarray, ...]:
     cell = side / GRID
     corner = np.array([left, top]) + (cell - 1) / 2
     window = Image.fromarray(mask).crop((left, top, left + side, top + side))
-    grid = np.asarray(window.resize((GRID, GRID), Image.Resampling.BOX))
+    # Areas where pixels are smaller than cells; where they are larger, areas would make stairs.
+    grid = np.asarray(window.resize((GRID, GRID), Image.Resampling.BOX if cell > 1 else Image.Resampling.BILINEAR))
     centers = corner[:, None] + cell * np.arange(GRID)
     # Beyond the picture nothing is known: the person may go on there.
     beyond = ~(
