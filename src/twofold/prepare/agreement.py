@@ -20,7 +20,7 @@ from twofold.prepare.body_points import body_points
 from twofold.prepare.motion import Motion, Posed, choose, place_points, pose_motion
 from twofold.prepare.outlines import open_mask
 from twofold.prepare.quality import PictureQuality, picture_quality
-from twofold.prepare.watch import Watched, spread_out
+from twofold.prepare.watch import Watched, save_picture, spread_out
 
 _COLOR_SAMPLE = 120
 """Pictures from which a vertex's usual colour is learned."""
@@ -88,8 +88,8 @@ def compare_with_pictures(
                 if hidden.any():
                     ignored[time] = watched.masks[time].with_suffix(".ignored.png")
                     with plain_errors(watched.masks[time].parent):
-                        Image.fromarray(mask).save(watched.masks[time], compress_level=1)
-                        Image.fromarray(hidden * np.uint8(255)).save(ignored[time], compress_level=1)
+                        save_picture(watched.masks[time], mask, compress_level=1)
+                        save_picture(ignored[time], hidden * np.uint8(255), compress_level=1)
             silhouette, person = seen.silhouette(camera.height, camera.width), mask > 127
             counted = np.ones_like(person) if time not in ignored else open_mask(ignored[time]) == 0
             iou = float((silhouette & person & counted).sum() / max(((silhouette | person) & counted).sum(), 1))

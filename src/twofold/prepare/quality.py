@@ -1,5 +1,6 @@
 """How well the fitted body agrees with each picture, which pictures to leave out, and when a clip cannot work."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
@@ -53,9 +54,12 @@ class PictureQuality:
     cropped: bool
     fault: str = ""
 
-    def row(self) -> dict[str, float | str | bool]:
-        """For the capture's notes."""
-        return {k: round(v, 3) if isinstance(v, float) else v for k, v in asdict(self).items()}
+    def row(self) -> dict[str, float | str | bool | None]:
+        """For the capture's notes; None where nothing was there to measure, as JSON has no infinity."""
+        return {
+            k: (round(v, 3) if math.isfinite(v) else None) if isinstance(v, float) else v
+            for k, v in asdict(self).items()
+        }
 
 
 def picture_quality(

@@ -3,6 +3,7 @@
 Memory does not grow with the clip's length but for the landmarks, a few hundred bytes a picture.
 """
 
+import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,8 +92,8 @@ def watch_clip(
         images.append(scratch / f"{stem}.jpg")
         masks.append(scratch / f"{stem}.png")
         with plain_errors(scratch):
-            Image.fromarray(image).save(images[-1], quality=_QUALITY, subsampling=0)
-            Image.fromarray(mask).save(masks[-1], compress_level=1)
+            save_picture(images[-1], image, quality=_QUALITY, subsampling=0)
+            save_picture(masks[-1], mask, compress_level=1)
         # The mask is a file now; keeping it would fill the memory.
         seen.append(Observation(found.pixels, found.visibility, found.world, np.zeros((1, 1), np.uint8)))
         sources.append(picture.source)
@@ -108,6 +109,13 @@ def watch_clip(
     # A single wrong guess about the shift is no moving camera.
     shift = float(np.quantile(moved, 0.8)) if moved else 0.0
     return Watched(tuple(images), tuple(masks), track_of(seen), tuple(sources), shift, tuple(sample))
+
+
+def save_picture(path: Path, pixels: UInt8[np.ndarray, "h w *c"], **options: int) -> None:
+    """Writes a picture file; unlike Pillow's own writing it notices a disk that takes only a part."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, Image.registered_extensions()[path.suffix], **options)
+    path.write_bytes(buffer.getvalue())
 
 
 def clean_mask(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:

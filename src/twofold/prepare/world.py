@@ -50,10 +50,11 @@ def stand_upright(
         translations: metres.
         cameras: by name.
     """
-    start = up.double()
-    turn = shortest_turns(start[None], torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))[0]
-    if float(start[1]) < -0.98:
-        turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    start, over = up.double(), torch.eye(3, dtype=torch.float64)
+    if float(start[1]) < 0:
+        # Cameras have y down: half a turn first, so that the rest is never close to another half.
+        over = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    turn = shortest_turns((over @ start)[None], torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))[0] @ over
     moved: dict[str, Camera] = {}
     turned, shifted = poses.double(), translations.double()
     for name, camera in cameras.items():
