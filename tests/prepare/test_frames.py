@@ -247,7 +247,8 @@ def damaged(folder):
 def test_a_playlist_calls_nobody(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"http://127.0.0.1:{server.getsockname()[1]}/clip.ts"
-        (tmp_path / "list.m3u8").write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{address}\n#EXT-X-ENDLIST\n")
+        entries = ("#EXTM3U", "#EXT-X-TARGETDURATION:1", "#EXTINF:1,", address, "#EXT-X-ENDLIST", "")
+        (tmp_path / "list.m3u8").write_text("\n".join(entries))
         server.settimeout(0.2)
         answers = threading.Thread(target=hang_up, args=(server,))
         answers.start()
