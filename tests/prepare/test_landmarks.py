@@ -1,4 +1,5 @@
-from types import SimpleNamespace
+import os
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ class Pretended:
     """Stands for MediaPipe's graph: finds what it is told to."""
 
     def __init__(self, **options):
-        self.options, self.clock, self.times, self.closed = options, 0, [], False
+        self.options, self.clock, self.times, self.closed = options, 0, [], 0
         self._simulated_timestamp = 0
         self.found = True
 
@@ -22,6 +23,7 @@ class Pretended:
         self._simulated_timestamp += 33_333
         self.times.append(self._simulated_timestamp)
         assert image.flags.c_contiguous
+        os.write(2, b"found" if self.found else b"sought")
         if not self.found:
             return SimpleNamespace(pose_landmarks=None, pose_world_landmarks=None, segmentation_mask=None)
         points = [SimpleNamespace(x=i / 33, y=1 - i / 33, z=0.0, visibility=i / 32) for i in range(33)]
@@ -33,7 +35,7 @@ class Pretended:
         )  # fmt: skip
 
     def close(self):
-        self.closed = True
+        self.closed += 1
 
 
 @pytest.fixture
@@ -44,14 +46,10 @@ def pretended(monkeypatch):
         made.append(Pretended(**options))
         return made[-1]
 
-    module = SimpleNamespace(solutions=SimpleNamespace(pose=SimpleNamespace(Pose=pose)))
+    module = ModuleType("mediapipe")
+    module.solutions = SimpleNamespace(pose=SimpleNamespace(Pose=pose))
     monkeypatch.setattr(landmarks, "load_mediapipe", lambda: module)
-    monkeypatch.setattr(landmarks._BlazePose, "__init__", unchecked)
     return made
-
-
-def unchecked(self, mediapipe, masks):
-    self._mediapipe, self._masks, self._graph, self._heard_all, self._microseconds = mediapipe, masks, None, False, 0
 
 
 def picture(height=20, width=66):
@@ -78,8 +76,18 @@ def test_nobody(pretended):
     assert np.isnan(found.pixels).all()
     assert np.isnan(found.world).all()
     assert not found.visibility.any()
+    assert found.mask.shape == (20, 66)
     assert not found.mask.any()
     assert not track_of([found]).found.any()
+
+
+def test_it_is_silenced_until_somebody_was_found(pretended, capfd):
+    estimator = mediapipe_estimator()
+    estimator(picture(), 0.0)
+    pretended[0].found = False
+    assert capfd.readouterr().err == ""
+    estimator(picture(), 0.1)
+    assert capfd.readouterr().err == "sought"
 
 
 def test_its_clock_follows_the_clip(pretended):
@@ -98,7 +106,7 @@ def test_masks_are_left_out_on_demand(pretended):
     assert pretended[0].options["enable_segmentation"] is False
     estimator.close()
     estimator.close()
-    assert pretended[0].closed
+    assert pretended[0].closed == 1
 
 
 def test_nobody_in_a_blank_picture_and_not_a_word(capfd):
