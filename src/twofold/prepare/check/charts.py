@@ -21,7 +21,7 @@ def agreement_svg(frames: Sequence[FrameFacts]) -> str:
     first, last = min(times), max(max(times), min(times) + 1)
     low = min(0.5, 0.1 * math.floor(10 * min(frame.iou for frame in frames)))
 
-    def x(time: float) -> float:
+    def x(time: int) -> float:
         return LEFT + (time - first) / (last - first) * (WIDTH - LEFT - RIGHT)
 
     def y(iou: float) -> float:
@@ -53,7 +53,7 @@ def sides_svg(azimuths: Sequence[float]) -> str:
     """The body from above, and the directions that cameras see it from: degrees, 0 in front, 90 at its left."""
     size, middle, radius = 300, 150, 96
 
-    def at(degrees: float, r: float) -> str:
+    def at(degrees: float | int, r: int) -> str:
         angle = math.radians(degrees)
         return f"{middle + r * math.sin(angle):.1f},{middle + r * math.cos(angle):.1f}"
 

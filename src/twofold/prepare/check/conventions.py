@@ -4,6 +4,7 @@ Every guess moves the same points of the body's surface, so that hundreds of gue
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,8 @@ IN_MOST = 0.75
 """Share of the frames in which a guess must be better."""
 EXCHANGED, EXCHANGED_GAIN = 0.7, 0.15
 """A picture shows another moment's pose where that fits so well, and so much better than its own."""
+MOST_PAIRS = 16
+"""So many of some seven hundred pairs are tried on all frames."""
 MOMENTS = 5
 """So many moments early or late are tried."""
 
@@ -109,11 +112,7 @@ def diagnose(samples: Sequence[Sample], size_ratio: float = 1.0) -> Diagnosis:
     fits: dict[tuple[Convention, ...], np.ndarray] = {(c,): _fits(samples, (c,)) for c in guesses}
     best = _best(fits)
     if max(given.mean(), fits[best].mean()) < GOOD_ENOUGH:
-        few = samples[:: max(len(samples) // 4, 1)]
-        pairs = [(a, b) for i, a in enumerate(guesses) for b in guesses[i + 1 :] if a.family != b.family]
-        rough = {pair: _fits(few, pair).mean() for pair in pairs}
-        likely = [pair for pair in pairs if rough[pair] >= max(rough.values()) - 2 * ALMOST_AS_GOOD]
-        fits |= {pair: _fits(samples, pair) for pair in likely[:12]}
+        fits |= {pair: _fits(samples, pair) for pair in _likely_pairs(samples, guesses)}
         best = _best(fits)
     found = fits[best]
     # Some conventions differ in some frames alone, such as those where the root is turned.
@@ -166,6 +165,22 @@ def poses_elsewhere(
         good = bool(fits) and fits[best] > max(EXCHANGED, sample.fit(sample.placed) + EXCHANGED_GAIN)
         found.append(times[best] if good and abs(times[best] - sample.time) > 1 else None)
     return found
+
+
+def _likely_pairs(samples: Sequence[Sample], guesses: Sequence[Convention]) -> list[tuple[Convention, Convention]]:
+    """Pairs of conventions that fit best, judged by a few frames and a part of the points."""
+    # A pose must be worked out anew for each guess, and who exchanges sides seldom errs elsewhere, too.
+    able = [c for c in guesses if c.family != "pose"]
+    rough: dict[tuple[Convention, Convention], float] = defaultdict(float)
+    for sample in samples[:: max(len(samples) // 3, 1)][:3]:
+        few = replace(sample.placed, points=sample.placed.points[::4])
+        for i, one in enumerate(able):
+            changed = one.change(few)
+            for other in able[i + 1 :]:
+                if one.family != other.family:
+                    rough[one, other] += sample.fit(other.change(changed))
+    likely = sorted(rough, key=lambda pair: -rough[pair])[:MOST_PAIRS]
+    return [pair for pair in rough if pair in likely]
 
 
 def _fits(samples: Sequence[Sample], conventions: tuple[Convention, ...]) -> np.ndarray:

@@ -18,7 +18,7 @@ from twofold.prepare.check.masks import MaskFacts, mask_facts
 
 LOOKED_AT = 320
 """Longest side, in pixels, at which body and mask are compared: finer than any fit is, and quick."""
-TWIN_SIZE = 96
+TWIN_SIZE = 144
 """Longest side at which twins are compared: many of them are tried, and a limb is still some pixels wide."""
 POINTS = 8000
 """Points that stand for the body's surface where many guesses are tried; three for each pixel it covers then."""

@@ -94,7 +94,7 @@ def _grown(p: Placed, ratio: float) -> Placed:
     return replace(p, points=pelvis + ratio * (p.points - pelvis))
 
 
-def _world(*rows: Sequence[float]) -> Callable[[Placed], Placed]:
+def _world(*rows: Sequence[float | int]) -> Callable[[Placed], Placed]:
     """The body lives in another world than the cameras."""
     turn = torch.tensor(rows, dtype=torch.float32)
     return lambda p: replace(p, points=p.points @ turn.T)
@@ -125,7 +125,7 @@ def _camera(change: Callable[[Tensor], Tensor]) -> Callable[[Placed], Placed]:
     return lambda p: replace(p, world_to_camera=change(p.world_to_camera))
 
 
-def _picture(change: Callable[[int, int], Sequence[Sequence[float]]]) -> Callable[[Placed], Placed]:
+def _picture(change: Callable[[int, int], Sequence[Sequence[float | int]]]) -> Callable[[Placed], Placed]:
     """Pictures whose pixels are stored in another order; `change` takes height and width."""
 
     def changed(p: Placed) -> Placed:
@@ -165,9 +165,9 @@ _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 _FLIP4 = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 
 
-def _rolled(angle: float) -> Callable[[Tensor], Tensor]:
-    c, s = round(math.cos(math.radians(angle))), round(math.sin(math.radians(angle)))
-    roll = torch.tensor([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float32)
+def _rolled(side: int) -> Callable[[Tensor], Tensor]:
+    """Turns a camera by a quarter about its own axis, to one side (1) or the other (-1)."""
+    roll = torch.tensor([[0, -side, 0, 0], [side, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float32)
     return lambda matrix: roll @ matrix
 
 
@@ -323,11 +323,11 @@ CONVENTIONS: tuple[Convention, ...] = (
     ),
     Convention(
         "camera rolled right", "the camera is rolled by a quarter against its pictures",
-        "exchange its first two rows and negate the new first", "camera", _camera(_rolled(90)),
+        "exchange its first two rows and negate the new first", "camera", _camera(_rolled(1)),
     ),
     Convention(
         "camera rolled left", "the camera is rolled by a quarter against its pictures",
-        "exchange its first two rows and negate the new second", "camera", _camera(_rolled(-90)),
+        "exchange its first two rows and negate the new second", "camera", _camera(_rolled(-1)),
     ),
     Convention(
         "principal point off the middle", "the principal point is not where the pictures show it",

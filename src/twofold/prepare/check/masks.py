@@ -45,7 +45,7 @@ def mask_facts(mask: UInt8[np.ndarray, "h w"]) -> MaskFacts:
     if not len(rows):
         return MaskFacts(0.0, 0.0, 0.0, 0.0, (), 0, 0.0, 0.0)
     part = (slice(max(rows[0] - 8, 0), rows[-1] + 9), slice(max(columns[0] - 8, 0), columns[-1] + 9))
-    inner, tall = person[part], rows[-1] - rows[0] + 1
+    inner, tall = person[part], int(rows[-1] - rows[0]) + 1
     outline = max(np.count_nonzero(inner & ~np.asarray(ndimage.binary_erosion(inner, border_value=1), dtype=bool)), 1)
     grey = np.count_nonzero((mask > 255 * SOFT[0]) & (mask < 255 * SOFT[1]))
     sizes = _piece_sizes(inner)

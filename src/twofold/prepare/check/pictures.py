@@ -59,7 +59,9 @@ def background_of(frames: Sequence[Frame]) -> Background:
         if np.count_nonzero(both) < 0.1 * both.size:
             continue
         shifts.append(_shift(first, beside, other, other_beside))
-        brightness.append(float(np.median(other[both]) / max(float(np.median(first[both])), 1e-3)))
+        usual = float(np.median(first[both]))
+        if usual > PLAIN:
+            brightness.append(max(float(np.median(other[both])), 1e-3) / usual)
     return Background(times, max(shifts, default=None), tuple(brightness))
 
 

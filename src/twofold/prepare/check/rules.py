@@ -22,9 +22,9 @@ ODD_PIXELS, OFF_CENTER = 0.05, 0.15
 """fy against fx; distance of the principal point from the picture's middle, in picture lengths."""
 MOVING, BRIGHTER = 0.01, 1.3
 """Shift of a background in picture lengths; ratio of its brightnesses: a third of an aperture stop."""
-HARD, SOFT, RAGGED, GRAIN = 0.05, 0.03, 0.003, 0.012
+HARD, SOFT, RAGGED, GRAIN = 0.05, 0.03, 0.0015, 0.012
 """Masks: width of the soft edge in pixels below which it is hard; in body heights, the width above which it is too soft
-(5 cm), how far an outline strays from a smooth one (5 mm), and how large its steps are (2 cm)."""
+(5 cm), how far an outline strays from a smooth one (3 mm, good ones 1 mm), and how large its steps are (2 cm)."""
 LOOSE = 0.05
 """Share of a mask that does not hang together with the rest: a forearm."""
 CROPPED, CUT_OFF = 0.1, 0.3
@@ -54,9 +54,18 @@ def judge(facts: Facts) -> Judgement:
     found = [*agreement(facts), *_scale(facts), *_masks(facts), *_sides_and_poses(facts), *_motion(facts)]
     found += [finding for camera in facts.cameras for finding in _camera(camera)]
     found += [*_backgrounds(facts), *_pictures(facts)]
+    found = _merged(found)
     known = {topic for f in found if f.level == "fault" for topic in FOLLOWS.get(f.topic, ())}
     order: tuple[Level, ...] = ("fault", "warning", "note")
     return Judgement(tuple(sorted((f for f in found if f.topic not in known), key=lambda f: order.index(f.level))))
+
+
+def _merged(findings: list[Finding]) -> list[Finding]:
+    """Findings of which those that differ in their place alone are one."""
+    groups: dict[tuple[Level, str, str, str], list[str]] = defaultdict(list)
+    for f in findings:
+        groups[f.level, f.topic, f.what, f.mend].append(f.where)
+    return [Finding(*key, "; ".join(where for where in places if where)) for key, places in groups.items()]
 
 
 def _scale(facts: Facts) -> Iterator[Finding]:
