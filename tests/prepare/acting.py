@@ -11,8 +11,8 @@ from little_body import little_body
 
 from twofold.body.anny import anny_body
 from twofold.body.skeleton import JOINT_NAMES
-from twofold.capture.masks import body_silhouette
 from twofold.geometry.cameras import Camera, project
+from twofold.geometry.raster import rasterize
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.prepare.body_points import body_points
 from twofold.prepare.evidence import Evidence
@@ -109,10 +109,13 @@ def landmarks(body, motion, camera, noise=0.0, seed=0):
 
 
 def silhouettes(body, motion, camera):
-    """Masks, 0 or 255."""
-    vertices = pose_motion(body, motion).place(choose(body, torch.arange(len(body.template))))
-    faces, pixels = body.faces.numpy(), project(camera, vertices)[0].numpy()
-    return [body_silhouette(one, faces, camera.height, camera.width) * np.uint8(255) for one in pixels]
+    """Masks, 255 where the body covers a pixel's centre, else 0."""
+    masks = []
+    for vertices in pose_motion(body, motion).place(choose(body, torch.arange(len(body.template)))):
+        mask = np.zeros(camera.height * camera.width, np.uint8)
+        mask[rasterize(camera, vertices, body.faces).pixel.numpy()] = 255
+        masks.append(mask.reshape(camera.height, camera.width))
+    return masks
 
 
 def evidence_of(body, motion, camera, noise=0.0, seed=0):

@@ -11,11 +11,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
+from torch import Tensor
 
 from twofold.body.skeleton import Body
 from twofold.capture.masks import SeenBody, see_body, usual_colors, without_objects
 from twofold.files import plain_errors
 from twofold.geometry.cameras import Camera, project
+from twofold.geometry.raster import rasterize
 from twofold.prepare.body_points import body_points
 from twofold.prepare.motion import Motion, Posed, choose, place_points, pose_motion
 from twofold.prepare.outlines import open_mask
@@ -68,9 +70,11 @@ def compare_with_pictures(
     everything = choose(body, torch.arange(len(body.template)))
     faces, focal = body.faces.numpy(), float(camera.intrinsics[0, 0])
 
+    def stand(time: int) -> Float[Tensor, "V 3"]:
+        return Posed(posed.transforms[time : time + 1], posed.vertices).place(everything)[0]
+
     def see(time: int) -> SeenBody | None:
-        one = Posed(posed.transforms[time : time + 1], posed.vertices)
-        pixels, depth = project(camera, one.place(everything)[0])
+        pixels, depth = project(camera, stand(time))
         if float(depth.min()) <= 0.01:
             return None
         return see_body(pixels.numpy(), depth.numpy(), faces, focal, camera.height, camera.width)
@@ -90,7 +94,7 @@ def compare_with_pictures(
                     with plain_errors(watched.masks[time].parent):
                         save_picture(watched.masks[time], mask, compress_level=1)
                         save_picture(ignored[time], hidden * np.uint8(255), compress_level=1)
-            silhouette, person = seen.silhouette(camera.height, camera.width), mask > 127
+            silhouette, person = _silhouette(camera, stand(time), body), mask > 127
             counted = np.ones_like(person) if time not in ignored else open_mask(ignored[time]) == 0
             iou = float((silhouette & person & counted).sum() / max(((silhouette | person) & counted).sum(), 1))
         track = watched.track
@@ -105,6 +109,14 @@ def compare_with_pictures(
             qualities.append(quality)
             show(len(qualities) / len(motion))
     return Agreement(tuple(qualities), ignored)
+
+
+def _silhouette(camera: Camera, vertices: Float[Tensor, "V 3"], body: Body) -> Bool[np.ndarray, "h w"]:
+    """The pixels whose centres the body covers."""
+    # Painted triangles reach half a pixel too far all around, four percent of a person who is 400 pixels tall.
+    covered = np.zeros(camera.height * camera.width, dtype=bool)
+    covered[rasterize(camera, vertices, body.faces, cull=True).pixel.numpy()] = True
+    return covered.reshape(camera.height, camera.width)
 
 
 def _without_objects(

@@ -113,7 +113,8 @@ def _fit(
     best = starts[int(np.argmax(seen))]
     parts: list[Motion] = []
     first = _window(evidence, points_in_space, slice(best, best + WINDOW + OVERLAP))
-    known = _fit_window(body, first[0], fps, free_focal, config, first[1], None, lambda done: None)
+    # Distances told apart from translations would be those of one window only.
+    known = _fit_window(body, first[0], fps, free_focal, config, first[1], None, lambda done: None).settled(body)
     for number, start in enumerate(starts):
         some, space = _window(evidence, points_in_space, slice(start, start + WINDOW + OVERLAP))
         parts.append(
