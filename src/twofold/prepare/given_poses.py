@@ -73,9 +73,7 @@ def _betas(arrays: dict[str, np.ndarray], body: Body, path: Path) -> Float[Tenso
     betas = torch.zeros(body.shape_basis.shape[-1])
     if "betas" not in arrays:
         return betas
-    given = torch.from_numpy(_finite(arrays, ("betas",), path).astype(np.float32)).reshape(
-        -1, *arrays["betas"].shape[-1:]
-    )
+    given = np.atleast_2d(_finite(arrays, ("betas",), path).astype(np.float32))
     if (given != given[0]).any():
         raise TwofoldError(f"{path}: `betas` changes from picture to picture; a person has one shape, give its mean.")
     count = min(len(betas), given.shape[1])
