@@ -1,0 +1,145 @@
+"""Clips that cannot work, places that cannot be written, Ctrl-C: one sentence, and nothing is left behind."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from acting import HEIGHT
+from staged import PLAIN, Stage, names
+
+from twofold.capture.contents import read_contents
+from twofold.errors import TwofoldError
+from twofold.prepare import pipeline
+from twofold.prepare.people import People
+from twofold.prepare.pipeline import prepare
+
+
+def too_short(stage):
+    for path in sorted(stage.clips[0].iterdir())[5:]:
+        path.unlink()
+
+
+def half_bad(stage):
+    for time in range(2, 8):
+        stage.spoil(time, np.roll(stage.evidence["cam0"].masks[time], 60, 1))
+
+
+def cut_off(stage):
+    stage.evidence["cam0"].track.pixels[:, [27, 28]] = [50, HEIGHT + 20]
+
+
+def damaged(stage):
+    (stage.clips[0] / "009.png").write_bytes(b"no picture")
+
+
+FAILURES = [
+    (too_short, {}, "has 5 pictures, expected at least 12"),
+    (lambda stage: stage.nobody(range(14)), {}, "shows nobody; film one whole person"),
+    (lambda stage: stage.nobody(range(5)), {}, "shows a person in only 64 % of the pictures"),
+    (half_bad, {}, "6 of 14 pictures of cam0 could not be understood (moments 2-7); at 2, for one, the body does not"),
+    (cut_off, {}, "of cam0 head, hands or feet are beyond the picture's edge"),
+    (damaged, {}, "009.png cannot be read as a picture"),
+    (lambda stage: None, {"train_camera": "side"}, "--train-camera side is none of the clips; they are cam0."),
+    (lambda stage: None, {"held_out": 1}, "One moment of 1 cannot be held out"),
+    (lambda stage: stage.clips.append(stage.clips[0]), {}, "2 videos were given, which need --calibration"),
+    (lambda stage: stage.clips.clear(), {}, "none was given"),
+    (lambda stage: stage.clips.__setitem__(0, stage.folder / "gone.mp4"), {}, "gone.mp4 does not exist"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "changes", "words"), FAILURES)
+def test_clips_that_cannot_work_are_refused_and_leave_nothing(tmp_path, monkeypatch, spoil, changes, words):
+    stage = Stage(tmp_path / "clips", 14)
+    spoil(stage)
+    stage.is_understood(monkeypatch)
+    with pytest.raises(TwofoldError) as error:
+        stage.prepare(tmp_path / "new" / "me", replace(PLAIN, **changes))
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+    assert names(tmp_path) == ["clips"]
+    assert all(finder.closed for finder in stage.finders)
+
+
+@pytest.mark.parametrize("refuse", ["refuse", "ignore"])
+def test_several_people_are_refused_unless_told_otherwise(tmp_path, monkeypatch, refuse):
+    stage, shown = Stage(tmp_path / "clips", 14), []
+    stage.is_understood(monkeypatch)
+
+    def crowd(pictures):
+        shown.extend(pictures)
+        return People((2,) * len(pictures))
+
+    config = replace(PLAIN, several_people=refuse)
+    if refuse == "ignore":
+        stage.prepare(tmp_path / "me", config, people=crowd)
+        assert not shown
+        return
+    with pytest.raises(TwofoldError, match="shows several people of about the same size in 100 % of its pictures"):
+        stage.prepare(tmp_path / "me", config, people=crowd)
+    assert len(shown) >= 12
+    assert names(tmp_path) == ["clips"]
+
+
+@pytest.mark.parametrize("where", ["looking", "fitting", "judging"])
+def test_ctrl_c_leaves_nothing(tmp_path, monkeypatch, where):
+    stage = Stage(tmp_path / "clips", 14)
+    stage.is_understood(monkeypatch)
+
+    def stop(*given, **named):
+        raise KeyboardInterrupt
+
+    if where == "looking":
+        stage.interrupt = KeyboardInterrupt()
+    elif where == "fitting":
+        monkeypatch.setattr(pipeline, "fit", stop)
+    else:
+        monkeypatch.setattr(pipeline, "compare_with_pictures", stop)
+    with pytest.raises(KeyboardInterrupt):
+        stage.prepare(tmp_path / "new" / "me")
+    assert names(tmp_path) == ["clips"]
+    assert all(finder.closed for finder in stage.finders)
+
+
+def content(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_what_lies_there_is_overwritten_only_if_asked_and_if_all_goes_well(tmp_path, monkeypatch):
+    stage = Stage(tmp_path / "clips", 14)
+    stage.is_understood(monkeypatch)
+    out = tmp_path / "me"
+    stage.prepare(out)
+    before = content(out)
+    again = partial(prepare, stage.clips, out, stage.body)
+    calls = []
+    with pytest.raises(TwofoldError, match="already holds a capture; choose another name or overwrite it"):
+        again(lambda: calls.append(1), PLAIN)
+    assert not calls  # known before any work
+    stage.finders.clear()
+    stage.interrupt = TwofoldError("The estimator is tired.")
+    with pytest.raises(TwofoldError, match="tired"):
+        again(stage.estimator, PLAIN, overwrite=True)
+    assert content(out) == before
+    stage.interrupt = None
+    stage.finders.clear()
+    again(stage.estimator, replace(PLAIN, credit="somebody"), overwrite=True)
+    assert read_contents(out)[0].credit == "somebody"
+    after = content(out)
+    assert {path for path in after if after[path] != before[path]} == {
+        path for path in before if path.name == "capture.json"
+    }
+    (out / "mine.txt").write_text("do not lose this")
+    with pytest.raises(TwofoldError, match=r"holds mine.txt, which is no part of a capture"):
+        again(stage.estimator, PLAIN, overwrite=True)
+    assert (out / "mine.txt").exists()
+    assert names(tmp_path) == ["clips", "me"]
+
+
+def test_a_place_that_cannot_be_written_is_known_before_any_work(tmp_path, monkeypatch):
+    stage = Stage(tmp_path / "clips", 12)
+    stage.is_understood(monkeypatch)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(TwofoldError, match="Cannot write"):
+        stage.prepare(tmp_path / "file" / "me")
+    assert not stage.finders
