@@ -70,7 +70,7 @@ def measure(recipe: Recipe, repeats: int, device: torch.device) -> dict[str, obj
         for name, begin, end in zip(split, marks[:-1], marks[1:], strict=True):
             split[name] += end - begin
         rays, count = len(batch.rays), count + 1
-        samples = len(avatar._place(batch.rays, posed, generator)[0]) if count == 1 else samples
+        samples = len(avatar._place(batch.rays, posed, generator).samples) if count == 1 else samples
 
     result = timed(step, repeats, warm=1 if repeats > 1 else 0)
     return {

@@ -119,6 +119,19 @@ def test_a_wrong_setting_is_named(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("words", [
+    ["--set", "training.steps=7", "training.pixels.rays=64", "--seed", "3"],
+    ["--set", "training.steps=7", "--seed", "3", "--set", "training.pixels.rays=64"],
+    ["--seed", "3", "--set=training.steps=7", "--set", "training.pixels.rays=64"],
+])  # fmt: skip
+def test_settings_come_in_one_list_or_one_by_one(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    main(["train", "--settings", *words])
+    shown = capsys.readouterr()
+    text = "".join((shown.out + shown.err).split())
+    assert "training.steps=7" in text
+    assert "training.pixels.rays=64" in text
+
+
 def test_an_unknown_device_is_named(person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "nonsense" in refused(capsys, "train", person_folder, "--out", tmp_path / "run", "--device", "nonsense")
 

@@ -1,3 +1,7 @@
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -41,3 +45,21 @@ def test_other_faults_pass_as_they_are(monkeypatch):
     monkeypatch.setattr(torch, "compile", lambda method, dynamic: method)
     with pytest.raises(RuntimeError, match="mine"), compiled_methods(Doubler(), ["double"]):
         raise RuntimeError("mine")
+
+
+@pytest.mark.parametrize(("given", "before", "expected"), [
+    (None, "", "PASSIVE"), ("ACTIVE", "", "ACTIVE"), (None, "import torch", None),
+])  # fmt: skip
+def test_waiting_threads_give_up_their_core_unless_told_otherwise_or_too_late(given, before, expected):
+    code = f"import os\n{before}\nfrom twofold.speed import tune_process\ntune_process()\n"
+    code += "print(os.environ.get('OMP_WAIT_POLICY'))"
+    environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"}
+    environment |= {} if given is None else {"OMP_WAIT_POLICY": given}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == str(expected)
+
+
+def test_the_command_line_loads_torch_only_after_it_is_told_how_to_wait():
+    code = "import sys, twofold.cli; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

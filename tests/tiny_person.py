@@ -15,7 +15,7 @@ from twofold.capture.types import Capture
 from twofold.field.factorized_grid import GridFieldConfig
 from twofold.geometry.cameras import Camera
 from twofold.geometry.raster import box_filter, rasterize, supersampled
-from twofold.methods.factorized import ShellSampler
+from twofold.methods.placing import ShellSampler
 from twofold.recipes import quick
 from twofold.train.loop import Progress, train
 from twofold.train.run import Recipe

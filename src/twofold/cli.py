@@ -41,7 +41,7 @@ def train(
         capture: Capture folder (`twofold studio`, `twofold import`).
         out: Run folder to make; by default runs/NAME-RECIPE.
         recipe: quick (minutes on a CPU), fast (the released networks, sampled near the body), released, paper.
-        set: One setting, such as training.steps=500; may be given several times.
+        set: Settings, such as training.steps=500; one or several, once or several times.
         seed: Of everything random.
         device: auto, cpu, cuda or cuda:N.
         resume: Run folder of an interrupted training to continue.
@@ -236,11 +236,24 @@ def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     return chosen
 
 
+def _one_by_one(words: Sequence[str]) -> list[str]:
+    """`--set a=1 b=2` as `--set a=1 --set b=2`, which is how the parser takes lists of any length."""
+    spread: list[str] = []
+    setting = False
+    for word in words:
+        setting = word == "--set" or (setting and "=" in word and not word.startswith("-"))
+        if setting and word != "--set" and spread[-1] != "--set":
+            spread.append("--set")
+        spread.append(word)
+    return spread
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `twofold` command: exit code 0, 1 where a check fails, 2 for bad input, 130 after Ctrl-C."""
     try:
         command = tyro.extras.subcommand_cli_from_dict(
-            {name: _later(command) for name, command in COMMANDS.items()}, prog="twofold", args=arguments,
+            {name: _later(command) for name, command in COMMANDS.items()}, prog="twofold",
+            args=_one_by_one(sys.argv[1:] if arguments is None else arguments),
             description="A video of a person goes in, an avatar comes out.", config=(tyro.conf.AvoidSubcommands,),
         )  # fmt: skip
         from twofold.speed import tune_process

@@ -26,11 +26,15 @@ def flush_denormals() -> None:
 
 
 def tune_process() -> None:
-    """Flushes denormals and keeps freed memory for the next step.
+    """Threads that wait give up their core, denormals are flushed, and freed memory is kept for the next step.
 
+    Waiting: OpenMP's threads spin between two pieces of work. Where something else wants a core too, each spins while
+    the other is not running, and small pieces take ten times as long. Only a process without torch so far can be told.
     Memory: glibc returns large blocks to the system and fetches them again zeroed, page by page, at every step.
-    Call it before the first parallel operation; elsewhere than on Linux only the first half applies.
+    Call it before the first parallel operation; elsewhere than on Linux that part is left out.
     """
+    if "torch" not in sys.modules:
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     flush_denormals()
     if sys.platform != "linux" or "MALLOC_" in "".join(os.environ) or "GLIBC_TUNABLES" in os.environ:
         return

@@ -10,7 +10,7 @@ from twofold.geometry.cameras import Camera, pixel_grid, pixel_rays
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigid_transform
 from twofold.losses import total
 from twofold.methods.base import Rendering, Subject
-from twofold.methods.factorized import ShellSampler
+from twofold.methods.placing import ShellSampler
 from twofold.outputs.views import draw
 from twofold.recipes import RECIPES
 from twofold.train.run import load_state

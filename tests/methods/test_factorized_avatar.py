@@ -8,7 +8,8 @@ from small_recipes import CASES, LATE
 from twofold.capture.pixels import PixelSource
 from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods.base import Subject
-from twofold.methods.factorized import PoseConfig, ShellSampler
+from twofold.methods.factorized import PoseConfig
+from twofold.methods.placing import ShellSampler
 from twofold.metrics.perceptual import LPIPS
 from twofold.outputs.views import draw
 from twofold.train.run import load
@@ -194,7 +195,8 @@ def test_one_sample_composites_as_the_formula_says(subject, person):
     rays, posed = rays_of(person), pose_of(avatar, person)
     with torch.no_grad():
         found = avatar.render(rays, posed, BLACK)
-        samples, nearest, *_ = avatar._place(rays, posed, None)
+        placed = avatar._place(rays, posed, None)
+        samples, nearest = placed.samples, placed.nearest
         which = int(torch.bincount(samples.ray_index).argmax())
         own = samples.ray_index == which
         forward = posed.forward[nearest[own, 0]]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from twofold.geometry.cameras import Rays
 from twofold.geometry.samples import Samples
-from twofold.volume.rendering import composite, composite_weights, laplace_density, seen_samples
+from twofold.volume.rendering import composite, composite_weights, laplace_density, possible_samples, seen_samples
 
 
 def literal_density(s, beta):
@@ -161,3 +161,23 @@ def test_following_rays_from_the_front_finds_the_samples_that_count(least: float
     assert torch.equal(seen, composite_weights(density, samples) > least)
     assert asked.max() == 1
     assert asked.sum() < len(depth)
+
+
+@given(counts=COUNTS, seed=st.integers(0, 1000), doubt=st.floats(0, 1), least=st.sampled_from([1e-3, 0.05, 0.3]))
+def test_samples_that_count_are_possible_however_little_is_known_of_the_densities(counts, seed, doubt, least):
+    samples, density = packed(counts, seed)
+    fewest, most = density * (1 - doubt), density * (1 + 3 * doubt)
+    possible = possible_samples(samples, fewest, most, least)
+    assert (possible | (composite_weights(density, samples) <= least)).all()
+
+
+@given(counts=COUNTS, seed=st.integers(0, 1000))
+def test_with_known_densities_only_samples_that_count_are_possible(counts, seed):
+    samples, density = packed(counts, seed)
+    assert torch.equal(possible_samples(samples, density, density, 0.05), composite_weights(density, samples) > 0.05)
+
+
+def test_behind_what_is_surely_opaque_nothing_is_possible():
+    samples = Samples(torch.zeros(4, dtype=torch.long), torch.arange(4.0), torch.ones(4))
+    fewest, most = torch.tensor([0.0, 20.0, 0.0, 0.0]), torch.tensor([0.0, torch.inf, torch.inf, 5.0])
+    assert possible_samples(samples, fewest, most, 1e-3).tolist() == [False, True, False, False]

@@ -26,14 +26,29 @@ def laplace_density(sdf: Float[Tensor, "*b"], beta: Float[Tensor, ""]) -> Float[
 def composite_weights(density: Float[Tensor, "S"], samples: Samples) -> Float[Tensor, "S"]:
     """What each sample adds to its ray, T_i (1 - exp(-sigma_i delta_i)); a ray's weights sum to at most one."""
     optical = density * samples.delta
+    return torch.exp(-_optical_depth(optical, samples)) * -torch.expm1(-optical)
+
+
+def possible_samples(
+    samples: Samples, fewest: Float[Tensor, "S"], most: Float[Tensor, "S"], least: float
+) -> Bool[Tensor, "S"]:
+    """Which samples can have a weight above `least` when their densities (per metre) lie between two bounds.
+
+    A weight is largest where the sample itself is as dense, and all before it as thin, as they can be.
+    """
+    reaches = torch.exp(-_optical_depth(fewest * samples.delta, samples))
+    return reaches * -torch.expm1(-most * samples.delta) > least
+
+
+def _optical_depth(optical: Float[Tensor, "S"], samples: Samples) -> Float[Tensor, "S"]:
+    """Sum of sigma_j delta_j over the samples j before each one on its ray."""
     # One running sum over all rays would lose digits in float32; what a ray starts with is taken off again.
     total = torch.cumsum(optical.double(), 0)
     before = total - optical
     first = torch.ones_like(samples.ray_index, dtype=torch.bool)
     first[1:] = samples.ray_index[1:] != samples.ray_index[:-1]
     start = torch.cummax(torch.where(first, torch.arange(len(samples), device=first.device), 0), 0).values
-    depth = (before - before[start]).to(optical.dtype)
-    return torch.exp(-depth) * -torch.expm1(-optical)
+    return (before - before[start]).to(optical.dtype)
 
 
 @torch.no_grad()

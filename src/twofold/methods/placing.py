@@ -1,0 +1,148 @@
+"""Where methods with a body put the samples of a ray: in a shell around it, or by the error-bounded sampler."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from twofold.deform.shell import nearest_listed, sample_shell
+from twofold.deform.skinning import neighbour_weights, to_canonical
+from twofold.field.distance_table import DistanceTable
+from twofold.geometry.cameras import Rays, clip_to_box
+from twofold.geometry.samples import Samples
+from twofold.geometry.trees import search_tree
+from twofold.methods.base import PosedAvatar
+from twofold.volume.rendering import laplace_density, possible_samples, seen_samples
+from twofold.volume.samplers import ErrorBoundedSampler
+
+Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
+"""A field's signed distance at canonical points, metres."""
+
+
+@dataclass(frozen=True)
+class ShellSampler:
+    """Samples near the posed body only, and of these only the ones that can be seen."""
+
+    radius: float = 0.06
+    """How far from the body's vertices samples are taken, metres."""
+    step: float = 0.01
+    """Distance of samples on a ray, metres."""
+    voxel: float = 0.02
+    """Edge of the voxels that list where the shell is, metres."""
+    least_weight: float = 1e-3
+    """Samples that a pass without gradients finds to add less than this to their pixel are left out; 0 keeps all."""
+    table_voxel: float = 0.015
+    """Pictures from dense networks: spacing of a lattice of distances, asked once a pose, that tells most samples to be
+    empty or hidden before the networks are asked; metres, 0 asks the networks about every sample."""
+
+    def __post_init__(self) -> None:
+        """Refuses sizes that leave nothing to sample."""
+        if min(self.radius, self.step, self.voxel) <= 0 or self.table_voxel < 0:
+            raise ValueError("radius, step and voxel should be positive, table_voxel not negative")
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Samples of some rays and what carries them home.
+
+    Attributes:
+        samples: packed.
+        nearest: the K nearest body vertices of each.
+        shares: the weight of each of these.
+        outlier: too far from the body to count.
+    """
+
+    samples: Samples
+    nearest: Int[Tensor, "S K"]
+    shares: Float[Tensor, "S K"]
+    outlier: Bool[Tensor, "S"]
+
+    def __getitem__(self, index: Tensor) -> "Placed":
+        return Placed(self.samples[index], self.nearest[index], self.shares[index], self.outlier[index])
+
+
+def place_in_shell(
+    sampler: ShellSampler, rays: Rays, posed: PosedAvatar, neighbours: int, limit: float,
+    generator: torch.Generator | None,
+) -> Placed:  # fmt: skip
+    """Every sample of the rays within `limit` metres of the body; a generator moves each ray's comb at random."""
+    samples, nearest, squared = sample_shell(posed.shell, rays, sampler.step, generator, limit)
+    if neighbours > 1:
+        points = samples.points(rays).detach()
+        nearest, squared = nearest_listed(posed.shell, points, posed.shell.rows_at(points), neighbours)
+    outlier = torch.zeros(len(samples), dtype=torch.bool, device=squared.device)
+    return Placed(samples, nearest, neighbour_weights(squared), outlier)
+
+
+@torch.no_grad()
+def only_seen(
+    placed: Placed, rays: Rays, posed: PosedAvatar, distance: Distance, beta: Float[Tensor, ""], least: float,
+    table: DistanceTable | None = None,
+) -> Placed:  # fmt: skip
+    """Those of the samples that add more than `least` to their pixel.
+
+    Args:
+        placed: all samples.
+        rays: that they lie on.
+        posed: carries them home.
+        distance: of the field.
+        beta: scale of the density, metres.
+        least: a weight (`composite_weights`).
+        table: of the same field in the same pose; what it knows to be empty or hidden is not asked.
+    """
+    x_canonical, _ = to_canonical(placed.samples.points(rays), placed.nearest, placed.shares, posed.forward)
+    if table is not None:
+        nearer, further = table.bounds(x_canonical)
+        most, fewest = laplace_density(nearer, beta), laplace_density(further, beta)
+        possible = possible_samples(placed.samples, fewest, most, least).nonzero()[:, 0]
+        placed, x_canonical = placed[possible], x_canonical[possible]
+
+    def density(index: Tensor) -> Tensor:
+        return laplace_density(distance(x_canonical[index]), beta)
+
+    return placed[seen_samples(placed.samples, density, len(rays), least)]
+
+
+def place_error_bounded(
+    sampler: ErrorBoundedSampler, rays: Rays, posed: PosedAvatar, neighbours: int, limit: float,
+    generator: torch.Generator | None, distance: Distance, beta: Float[Tensor, ""],
+) -> Placed:  # fmt: skip
+    """Samples in the box of the joints by the error-bounded sampler.
+
+    Args:
+        sampler: its constants.
+        rays: to place samples on.
+        posed: the body.
+        neighbours: how many nearest vertices carry a sample home.
+        limit: samples further than this from the body are outliers, metres.
+        generator: places them at random (training); None evenly.
+        distance: of the field.
+        beta: scale of the density, metres.
+    """
+    margin = 0.31
+    low, high = posed.body.joints.detach().amin(0) - margin, posed.body.joints.detach().amax(0) + margin
+    clipped, hit = clip_to_box(rays, low, high)
+    inside = hit.nonzero()[:, 0]
+    tree = search_tree(posed.body.vertices.detach().cpu().numpy())
+
+    def nearest_to(points: Tensor) -> tuple[Tensor, Tensor]:
+        away, index = tree.query(points.detach().cpu().numpy(), k=neighbours, workers=-1)
+        found = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), neighbours))
+        apart = torch.from_numpy(np.asarray(away, dtype=np.float32).reshape(len(points), neighbours))
+        return found.to(points.device), apart.to(points.device)
+
+    def sdf(points: Tensor) -> Tensor:
+        index, apart = nearest_to(points)
+        x_canonical, _ = to_canonical(points, index, neighbour_weights(apart**2), posed.forward.detach())
+        value = distance(x_canonical)
+        # The release treats outliers as empty only when it does not train.
+        return value if generator is not None else torch.where(apart[:, 0] > limit, 4.0, value)
+
+    with torch.no_grad():
+        samples = sampler.sample(clipped[inside], sdf, beta, generator, generator is not None)
+    samples = Samples(inside[samples.ray_index], samples.depth, samples.delta)
+    index, apart = nearest_to(samples.points(rays))
+    return Placed(samples, index, neighbour_weights(apart**2), apart[:, 0] > limit)

@@ -1,0 +1,100 @@
+"""A table of distances changes which samples the networks are asked about, and no picture."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_recipes import CASES
+
+from twofold.geometry.cameras import pixel_grid, pixel_rays
+from twofold.methods import factorized
+from twofold.methods.base import Subject
+from twofold.methods.placing import ShellSampler
+from twofold.train.loop import train
+
+BLACK = torch.zeros(3)
+
+
+@pytest.fixture(scope="module")
+def dense(person, tmp_path_factory):
+    """A dense avatar trained long enough to have a surface that lies in the shell."""
+    recipe = CASES["fast"]
+    losses = replace(recipe.method.losses, mask=1.0, s3im=0.0)
+    method = replace(recipe.method, beta=0.01, losses=losses, field=replace(recipe.method.field, radius=0.3))
+    training = replace(recipe.training, steps=60, preview_every=0, rate_low=2e-3, rate_high=1e-3)
+    recipe = replace(recipe, method=method, training=training)
+    return train(person, recipe, tmp_path_factory.mktemp("dense") / "run", torch.device("cpu"))
+
+
+@pytest.fixture
+def looking(dense, person, monkeypatch):
+    """Renders with a table of some spacing, and counts the samples that the distance network is asked about."""
+    monkeypatch.setattr(factorized, "_TABLE_PAYS", 10)
+    asked = []
+    sdf = dense.field.sdf
+    monkeypatch.setattr(dense.field, "sdf", lambda x, pose: asked.append(len(x)) or sdf(x, pose))
+    config = dense.config
+    frame = person.train[1]
+    rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
+
+    def look(spacing, posed=None):
+        dense.config = replace(config, sampler=replace(config.sampler, table_voxel=spacing))
+        posed = posed or dense.pose(frame.pose, frame.translation)
+        before = sum(asked)
+        with torch.no_grad():
+            return dense.render(rays, posed, BLACK), sum(asked) - before, posed
+
+    yield look
+    dense.config = config
+
+
+def test_pictures_are_the_same_with_a_table(looking):
+    (plain, many, _), (tabled, _, posed) = looking(0.0), looking(0.03)
+    assert 0.1 < plain.opacity.mean() < 0.9
+    for name in ("color", "opacity", "depth", "normal"):
+        torch.testing.assert_close(getattr(tabled, name), getattr(plain, name), atol=4e-3, rtol=0)
+    # With the table made already, fewer samples are left to ask about.
+    again, few, _ = looking(0.03, posed)
+    assert torch.equal(again.color, tabled.color)
+    assert 0 < few < 0.8 * many
+
+
+def test_a_table_belongs_to_one_pose_and_one_state_of_the_field(looking, dense):
+    _, first, posed = looking(0.03)
+    _, again, _ = looking(0.03, posed)
+    _, other, _ = looking(0.03)
+    assert again < first == other
+    with torch.no_grad():
+        next(dense.field.parameters()).mul_(1)
+    _, changed, _ = looking(0.03, posed)
+    assert changed > 2 * again
+
+
+def test_few_samples_are_asked_about_one_by_one(looking, monkeypatch):
+    monkeypatch.setattr(factorized, "_TABLE_PAYS", 10**9)
+    assert looking(0.03)[1] == looking(0.0)[1]
+
+
+def test_training_asks_about_every_sample(dense, person, looking):
+    looking(0.03)
+    frame = person.train[1]
+    posed = dense.pose(frame.pose, frame.translation, frame.time, 5)
+    rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1)[:40])
+    dense.train()
+    dense._last_table = None
+    dense.render(rays, posed, BLACK, torch.Generator().manual_seed(0))
+    assert dense._last_table is None
+    dense.eval()
+
+
+@pytest.mark.parametrize("wrong", [{"radius": 0.0}, {"step": -1.0}, {"table_voxel": -0.1}])
+def test_sizes_that_leave_nothing_to_sample_are_refused(wrong):
+    with pytest.raises(ValueError, match="positive"):
+        ShellSampler(**wrong)
+
+
+def test_a_table_is_for_dense_networks_only(person):
+    avatar = CASES["quick"].method.build(Subject.of(person)).eval()
+    frame = person.train[0]
+    posed = avatar.pose(frame.pose, frame.translation)
+    assert avatar._table(10**9, posed, lambda x: x[:, 0]) is None
