@@ -1,5 +1,6 @@
 """Every benchmark with one thread and with all, one after the other; results go to benchmarks/results/."""
 
+import argparse
 import subprocess
 import sys
 
@@ -8,6 +9,7 @@ import torch
 
 def main() -> None:
     """Runs them in processes of their own, so that each starts with fresh memory and threads."""
+    argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__).parse_args()
     for threads in sorted({1, torch.get_num_threads()}):
         for name in ("step", "rendering", "quality"):
             command = [sys.executable, "-m", f"benchmarks.{name}", "--threads", str(threads)]

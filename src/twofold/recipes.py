@@ -54,10 +54,15 @@ def paper() -> Recipe:
 
 
 def fast() -> Recipe:
-    """The released networks and losses with everything that makes them fast and changes no equation: shell sampling."""
+    """The released networks and losses with what makes them fast and changes no equation: shell sampling, bfloat16."""
     start = released()
     method = replace(
-        start.method, sampler=ShellSampler(), beta_form="softplus", outliers_in_shading=True, scene_scale="metres"
+        start.method,
+        field=replace(start.method.field, hidden_dtype="auto"),
+        sampler=ShellSampler(),
+        beta_form="softplus",
+        outliers_in_shading=True,
+        scene_scale="metres",
     )
     return replace(start, name="fast", method=method)
 

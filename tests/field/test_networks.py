@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from twofold.field import networks
 from twofold.field.networks import (
     Network,
     NetworkConfig,
@@ -220,6 +221,15 @@ def test_bf16_trains_through_the_pullback():
     ((gradient.norm(dim=1) - 1) ** 2).mean().backward()
     assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in network.parameters() if p.grad is not None)
     assert sum(p.grad is not None and bool(p.grad.any()) for p in network.parameters()) >= 9
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_the_hardware_decides_about_bf16_where_it_is_asked(fast, monkeypatch):
+    monkeypatch.setattr(networks, "bf16_is_fast", lambda device: fast)
+    config = NetworkConfig(inputs=3, outputs=2, depth=3, width=16, hidden_dtype="auto")
+    kinds = [matrix.dtype for matrix in config.build().at().matrices]
+    hidden = torch.bfloat16 if fast else torch.float32
+    assert kinds == [torch.float32, hidden, hidden, torch.float32]
 
 
 def test_processor_flags_are_read_where_linux_lists_them(tmp_path):

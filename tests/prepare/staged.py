@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
 from acting import HEIGHT, WIDTH, acted, before_camera, evidence_of, standing_camera, the_body
 from PIL import Image
 from scipy import ndimage
 
 from twofold.files import write_json
+from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.prepare import pipeline
 from twofold.prepare.clips import PrepareConfig
 from twofold.prepare.observations import Observation, nobody
@@ -21,9 +23,10 @@ PLAIN = PrepareConfig(held_objects="keep")
 class Stage:
     """Somebody who acts before one camera at the origin, or before several in a world of their own."""
 
-    def __init__(self, folder, moments=14, azimuths=(0.4,), turn=2.0, step=0):
+    def __init__(self, folder, moments=14, azimuths=(0.4,), turn=2.0, step=0, lean=0.0):
         self.folder, self.body = folder, the_body()
         self.motion = acted(self.body, moments, FPS, turn)
+        self.motion = replace(self.motion, guess=axis_angle_to_matrix(torch.tensor([0, 0, lean])) @ self.motion.guess)
         self.cameras = {
             f"cam{k}": standing_camera(azimuth, focal=FOCAL, distance=3.0) for k, azimuth in enumerate(azimuths)
         }

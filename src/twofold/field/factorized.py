@@ -51,7 +51,8 @@ class FactorizedFieldConfig:
         radius: the distance starts near that of a sphere, metres.
         gradients: of the distance by the point: "analytic", a reverse pass written by hand, or "autograd", the plain
             form with torch's own softplus. As in the released program the latter keeps no graph in evaluation mode.
-        hidden_dtype: of the layers between first and last; bfloat16 is off by about a millimetre and 1.5 degrees.
+        hidden_dtype: of the layers between first and last; bfloat16 is off by about a millimetre and 1.5 degrees;
+            "auto" takes it where the hardware is made for it.
     """
 
     low_octaves: int = 5
