@@ -55,6 +55,12 @@ def nan_pose(folder: Path) -> None:
     np.savez(folder / "motion.npz", **arrays)
 
 
+def no_weights(folder: Path) -> None:
+    with np.load(folder / "body.npz") as stored:
+        arrays = dict(stored)
+    np.savez(folder / "body.npz", **arrays | {"weights": 0 * arrays["weights"]})
+
+
 def edited(change: Callable[[dict], None]) -> Callable[[Path], None]:
     def spoil(folder: Path) -> None:
         data = json.loads((folder / "capture.json").read_text())
@@ -78,6 +84,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "empty folder": (lambda folder: (shutil.rmtree(folder), folder.mkdir())[1], "empty"),
     "missing mask": (lambda folder: first(folder, "masks").unlink(), "masks"),
     "wrong-sized mask": (wrong_size, "masks"),
+    "no weights": (no_weights, "weights"),
     "NaN pose": (nan_pose, "poses"),
     "all-black mask": (all_black, "masks"),
     "one frame only": (edited(one_frame), "one"),

@@ -31,7 +31,7 @@ def random_body(seed, vertices=40, pose_columns=207):
     return Body.from_arrays(
         {
             "name": np.array("cloud"),
-            "template": random.normal(size=(vertices, 3)),
+            "template": 0.4 * random.normal(size=(vertices, 3)),
             "faces": random.integers(0, vertices, (60, 3)),
             "weights": weights,
             "joints": random.normal(size=(24, 3)),
@@ -214,6 +214,11 @@ def test_a_body_comes_back_from_its_arrays():
         ("faces", np.full((1, 3), 40), r"outside 0\.\.39"),
         ("faces", np.full((1, 3), -1), r"outside 0\.\.39"),
         ("faces", np.zeros((0, 3), dtype=int), "no vertices or no faces"),
+        ("weights", np.zeros((40, 24)), r"row of weights in the file should sum to 1, row 0 sums to 0; divide"),
+        ("weights", np.eye(40, 24) * 1.01, r"row of weights in the file should sum to 1"),
+        ("weights", np.eye(40, 24) * 3 - 2 / 24, r"weights in the file should not be negative, the least is -0\.0833"),
+        ("template", np.zeros((40, 3)), r"template in the file should make a body of 0\.3 to 3 metres, it measures 0;"),
+        ("template", 100 * np.eye(40, 3), "to 3 metres, it measures 100; give metres"),
     ],
 )
 def test_a_fault_in_the_arrays_is_named(name, wrong, message):

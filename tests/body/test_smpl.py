@@ -29,7 +29,7 @@ def model(v=60, shapes=10, joints=24, seed=0):
     parents = np.array([PARENTS, range(24)]) if joints == 24 else np.zeros((2, joints))
     columns = 9 * (joints - 1)
     return {
-        "v_template": random.normal(size=(v, 3)) * 0.5,
+        "v_template": random.normal(size=(v, 3)) * 0.3,
         "shapedirs": random.normal(size=(v, 3, shapes)) * 0.03,
         "posedirs": random.normal(size=(v, 3, columns)) * 0.003,
         "J_regressor": regressor,

@@ -95,6 +95,7 @@ def poses(time, value):
         ({"translations": np.zeros((5, 3))}, "translations should be numbers of shape 6 x 3"),
         ({"translations": np.full((6, 3), np.nan)}, "translations is not finite at times 0-5"),
         ({"betas": np.array(["tall"])}, "betas should be numbers"),
+        ({"betas": np.full(1, 99.0)}, "betas should make a body of 0.3 to 3 metres, it measures"),
         ({"betas": np.zeros(2)}, "there are 2 betas, the body takes 1 at most"),
         ({"true_poses": np.zeros((5, 24, 3))}, "true_poses should be"),
         ({"translations": np.full((6, 3), 1000.0, np.float32) * [0, 0, 1]}, "has the body behind it"),

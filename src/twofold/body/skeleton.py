@@ -28,6 +28,9 @@ PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18,
 _GENERATIONS = (1, 4, 7, 10, 15, 18, 20, 22, 24)
 """Joints equally far from the root stand together in SMPL's order; here each such group begins (and the last ends)."""
 
+LEAST_SIZE, MOST_SIZE = 0.3, 3.0
+"""How far a body reaches along its longest axis, metres: newborns and giants are people, other units are not."""
+
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "template": ("V", 3), "faces": ("F", 3), "weights": ("V", 24), "joints": (24, 3),
     "shape_basis": ("V", 3, "S"), "joint_basis": (24, 3, "S"), "pose_basis": ("V", 3, "P"),
@@ -68,7 +71,8 @@ class Body:
         """A body from the arrays that `arrays` gave.
 
         Raises:
-            TwofoldError: an array is missing, has a wrong shape, or holds something that is no finite number.
+            TwofoldError: an array is missing, has a wrong shape, or holds something that is no finite number; or see
+                `require_surface`.
         """
         names = [f.name for f in fields(Body)]
         missing = [name for name in names if name not in arrays]
@@ -86,15 +90,55 @@ class Body:
                 raise TwofoldError(f"{name} in {where} should have the shape {expected}, it has {array.shape}.")
             if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
                 raise TwofoldError(f"{name} in {where} holds something that is no finite number; make the body again.")
-        v, p = sizes["V"], sizes["P"]
-        if v == 0 or sizes["F"] == 0:
-            raise TwofoldError(f"{where} has no vertices or no faces; make the body again.")
-        if p not in (0, 207):
-            raise TwofoldError(f"pose_basis in {where} should have 207 columns or none, it has {p}.")
-        if numbers["faces"].min() < 0 or numbers["faces"].max() >= v:
-            raise TwofoldError(f"faces in {where} name vertices outside 0..{v - 1}; the file is damaged.")
+        if sizes["P"] not in (0, 207):
+            raise TwofoldError(f"pose_basis in {where} should have 207 columns or none, it has {sizes['P']}.")
+        require_surface(numbers["template"], numbers["faces"], numbers["weights"], where)
         tensors = {n: torch.as_tensor(a.astype(np.float32)) for n, a in numbers.items() if n != "faces"}
         return Body(name=str(arrays["name"]), faces=torch.as_tensor(numbers["faces"].astype(np.int64)), **tensors)
+
+
+def require_surface(
+    vertices: np.ndarray, faces: np.ndarray, weights: np.ndarray, where: str, called: str = "template"
+) -> None:
+    """Refuses a surface that no person has, on which training would crash or ask for endless memory.
+
+    Args:
+        vertices: in the rest pose, metres, finite.
+        faces: triangles.
+        weights: skinning weights, one row a vertex, finite.
+        where: what holds them.
+        called: the vertices' name there.
+
+    Raises:
+        TwofoldError: there are no vertices or faces, faces name others, weights are negative or do not sum to 1, or
+            the body is smaller or larger than people are.
+    """
+    if not len(vertices) or not len(faces):
+        raise TwofoldError(f"{where} has no vertices or no faces; make the body again.")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise TwofoldError(f"faces in {where} name vertices outside 0..{len(vertices) - 1}; the file is damaged.")
+    if weights.min() < 0:
+        raise TwofoldError(
+            f"weights in {where} should not be negative, the least is {weights.min():.3g}; make the body again."
+        )
+    sums = weights.sum(1, dtype=np.float64)
+    worst = int(np.abs(sums - 1).argmax())
+    if abs(sums[worst] - 1) > 1e-3:
+        raise TwofoldError(
+            f"Each row of weights in {where} should sum to 1, row {worst} sums to {sums[worst]:.4g}; divide the rows "
+            "by their sums."
+        )
+    size = size_fault(vertices)
+    if size:
+        raise TwofoldError(f"{called} in {where} {size}; give metres.")
+
+
+def size_fault(vertices: np.ndarray) -> str:
+    """How a body with these vertices (metres) is no person's size, to end a sentence; empty where it is."""
+    longest = float(np.ptp(vertices, axis=0).max())
+    if LEAST_SIZE <= longest <= MOST_SIZE:
+        return ""
+    return f"should make a body of {LEAST_SIZE:g} to {MOST_SIZE:g} metres, it measures {longest:.3g}"
 
 
 @dataclass(frozen=True)

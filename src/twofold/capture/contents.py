@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from twofold.body.skeleton import Body
+from twofold.body.skeleton import Body, shape_body, size_fault
 from twofold.capture.types import SPLITS
 from twofold.errors import TwofoldError
 from twofold.files import read_json, read_npz
@@ -324,6 +324,9 @@ def _read_motion(
     betas = read.get("betas")
     if body is not None and betas is not None and len(betas) > body.shape_basis.shape[-1]:
         faults.append(f"{MOTION}: there are {len(betas)} betas, the body takes {body.shape_basis.shape[-1]} at most.")
+        betas = None
+    elif body is not None and betas is not None and (size := size_fault(shape_body(body, betas).vertices.numpy())):
+        faults.append(f"{MOTION}: betas {size}; take those that were fitted to this body.")
         betas = None
     return betas, read.get("poses"), read.get("translations")
 

@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from twofold.body.retarget import convert_pose, straighten
-from twofold.body.skeleton import PARENTS, Body, pose_body, shape_body
+from twofold.body.skeleton import PARENTS, Body, pose_body, require_surface, shape_body
 from twofold.capture.contents import spans
 from twofold.capture.folder import CaptureWriter
 from twofold.capture.masks import SeenBody, see_body, usual_colors, without_objects
@@ -227,6 +227,7 @@ def _read_arrays(source: Path) -> dict[str, np.ndarray]:
             raise TwofoldError(f"{name} in {where} holds a number that is not finite; prepare the capture again.")
     if tuple(arrays["parents"].tolist()) != PARENTS:
         raise TwofoldError(f"The joints in {where} do not hang together as SMPL's 24 do; bring them to that order.")
+    require_surface(arrays["rest_vertices"], arrays["faces"], arrays["weights"], str(where), "rest_vertices")
     return arrays
 
 
