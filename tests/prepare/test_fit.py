@@ -44,13 +44,15 @@ def cameras(*azimuths):
 
 
 def most(errors):
-    """Four fifths of the errors are smaller than this.
-
-    Not the largest: what is far off hardly pulls, so that the first, large steps now and then leave an arm caught
-    where it is far off, at some moment or other. Which one it is, rounding decides.
-    """
+    """Four fifths of the errors are smaller than this: for landmarks, whose noise has no largest value."""
     errors = np.asarray(errors)
     return float(np.quantile(errors[np.isfinite(errors)], 0.8))
+
+
+def worst(errors):
+    """The largest error: no arm stays caught where it never was, at no moment."""
+    errors = np.asarray(errors)
+    return float(errors[np.isfinite(errors)].max())
 
 
 def away(body, found, truth):
@@ -74,7 +76,7 @@ def test_two_calibrated_cameras_find_the_body_to_centimetres():
     evidence = [evidence_of(body, truth, view, noise=NOISE, seed=k) for k, view in enumerate(views)]
     found = fit(body, evidence, FPS, watch=told.append)
     # Better than any one landmark tells: a pixel is 5 mm there, and most are up to 14 mm off.
-    assert most(away(body, found, truth)) < 0.013
+    assert worst(away(body, found, truth)) < 0.013
     for view, one in zip(views, evidence, strict=True):
         assert np.median(overlap(silhouettes(body, found, view), one.masks)) > 0.94
         assert most(missed(body, found, view, one.track)) < MOST_NOISE
@@ -101,9 +103,9 @@ def test_one_camera_finds_what_it_can_see():
     assert scale == pytest.approx(float((1 + 0.1 * found.betas[0]) / (1 + 0.1 * truth.betas[0])), rel=0.02)
     # Nothing but people's usual size speaks for any: what is found is nearer to that than the truth is.
     assert abs(float(found.betas[0])) < float(truth.betas[0])
-    assert most((joints_of(body, found) / scale - joints_of(body, truth)).norm(dim=-1)) < 0.05
+    assert worst((joints_of(body, found) / scale - joints_of(body, truth)).norm(dim=-1)) < 0.05
     turns = [axis_angle_to_matrix(motion.full_pose()[:, 0]) for motion in (found, truth)]
-    assert most((turns[0] - turns[1]).norm(dim=(1, 2))) < 0.25
+    assert worst((turns[0] - turns[1]).norm(dim=(1, 2))) < 0.25
 
 
 @pytest.mark.parametrize("guess", [0.7, 1.4])
@@ -121,7 +123,7 @@ def test_an_unknown_focal_length_goes_towards_the_truth(guess):
     found = fit(body, [Evidence(wrong, track)], FPS, True, patient)
     assert 0.2 < float(found.log_focal) / -np.log(guess) < 1
     factor = float(found.log_focal.exp())
-    assert most(missed(body, found.settled(body), longer(wrong, factor), track)) < 1
+    assert worst(missed(body, found.settled(body), longer(wrong, factor), track)) < 1
 
 
 @pytest.mark.parametrize("guess", [0.7, 1.4])
@@ -180,8 +182,8 @@ def test_moments_that_show_nobody_are_bridged():
     errors = away(body, found, truth)
     assert errors.isfinite().all()
     # The motion goes on as it went: nearer to the truth than a straight line between the neighbours, 24 mm.
-    assert most(errors[3]) < 0.02
-    assert most(errors) < 0.015
+    assert worst(errors[3]) < 0.02
+    assert worst(errors) < 0.015
 
 
 def test_landmarks_in_space_without_masks_are_enough():
@@ -196,10 +198,10 @@ def test_landmarks_in_space_without_masks_are_enough():
     space = place_points(pose_motion(body, truth), body_points(body), truth).numpy()
     space[1, 13] = np.nan
     found = fit(body, evidence, FPS, points_in_space=space)
-    assert most(away(body, found, truth)) < 0.015
+    assert worst(away(body, found, truth)) < 0.02
     for view, one in zip(views, evidence, strict=True):
         # 8 mm there: without masks the fit ends while it is wide, and a caught arm pulls at its trunk.
-        assert most(missed(body, found, view, one.track)) < 1.5
+        assert worst(missed(body, found, view, one.track)) < 1.5
 
 
 def test_the_same_evidence_gives_the_same_motion():
@@ -238,10 +240,10 @@ def test_long_clips_are_fitted_window_by_window(short_windows, tmp_path):
     assert told == pytest.approx([1 / 3, 2 / 3, 1])
     settled = found.settled(body)
     joints, expected = joints_of(body, settled), joints_of(body, truth)
-    assert most(missed(body, settled, view, track)) < 1
+    assert worst(missed(body, settled, view, track)) < 1
     # Where windows meet nobody jumps: steps, up to 12 cm long, are as long as they really are.
     steps, real = (places.diff(dim=0).norm(dim=-1) for places in (joints, expected))
-    assert max(most(step) for step in (steps - real).abs()) < 0.02
+    assert max(worst(step) for step in (steps - real).abs()) < 0.02
     depth = joints[:, 0].norm(dim=1) / expected[:, 0].norm(dim=1)
     assert depth.std() < 0.005
 

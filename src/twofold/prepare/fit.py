@@ -22,6 +22,8 @@ from twofold.prepare.motion import Chosen, Motion, Posed, choose, pose_motion
 from twofold.prepare.outlines import Outlines, trace_outlines
 from twofold.prepare.terms import PriorWeights, direction_term, landmark_term, match_rims, outline_term, prior
 
+WARM_UP = 20
+"""Steps over which the rate grows to its full size."""
 WINDOW, OVERLAP = 240, 24
 """Moments fitted together, and how many of them two neighbours share."""
 
@@ -227,16 +229,20 @@ def _descend(
     rate: float,
     decay: bool = True,
 ) -> Motion:
-    """Adam on some of the unknowns."""
+    """Adam on some of the unknowns.
+
+    Its first steps move every unknown by the whole rate, however small the slope: along an arm that adds up to half a
+    metre, from where robust terms no longer find back. So the rate starts small.
+    """
     free = {name: getattr(motion, name).clone().requires_grad_() for name in changing}
     pace = {"translation": 0.5, "betas": 2.0, "marks": 0.05, "log_focal": 0.2, "log_distance": 0.3}
     groups = [{"params": [value], "lr": rate * pace.get(name, 1.0)} for name, value in free.items()]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     start = [rate * pace.get(name, 1.0) for name in free]
     for step in range(steps):
-        if decay:
-            for group, first in zip(optimizer.param_groups, start, strict=True):
-                group["lr"] = first * (1 - 0.8 * step / steps)
+        share = (1 - 0.8 * step / steps if decay else 1.0) * min(1.0, (step + 1) / WARM_UP)
+        for group, first in zip(optimizer.param_groups, start, strict=True):
+            group["lr"] = first * share
         now = replace(motion, **free)
         optimizer.zero_grad()
         loss(now, pose_motion(body, now)).backward()
