@@ -169,6 +169,21 @@ def test_a_run_is_trained_drawn_and_measured_and_each_command_says_where_and_wha
     assert "already holds a run" in refused(capsys, "train", person_folder, "--out", run)
 
 
+@pytest.mark.parametrize("command", ["render", "evaluate", "train"])
+def test_a_run_is_not_drawn_measured_or_continued_with_somebody_else(
+    command: str, trained: Run, person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, other = shutil.copytree(trained.folder, tmp_path / "run"), shutil.copytree(person_folder, tmp_path / "other")
+    with np.load(other / "motion.npz") as stored:
+        arrays = dict(stored)
+    np.savez(other / "motion.npz", **arrays | {"betas": arrays["betas"] + 0.1})
+    before = files(run)
+    with_it = [other, "--resume", run] if command == "train" else [run, "--capture", other]
+    said = refused(capsys, command, *with_it)
+    assert f"{other} is not what {run} was begun with (betas differs)" in said
+    assert files(run) == before
+
+
 SMALL = [
     "method.field.low_voxels=0.12,0.06", "method.field.high_voxels=0.04", "method.field.width=16",
     "method.field.shared=8", "training.pixels.rays=64", "training.preview_every=2", "training.checkpoint_every=2",

@@ -148,11 +148,12 @@ def render(
     """
     from twofold.capture.folder import read_capture
     from twofold.outputs.gallery import render_run
-    from twofold.train.run import choose_device, find_capture, load
+    from twofold.train.run import choose_device, find_capture, load, require_same
 
     at_least(size=(size, 8), chunk=(chunk, 1))
     avatar, _ = load(run, choose_device(device))
     read = read_capture(find_capture(run, capture))
+    require_same(run, read, motion=False)
     folder = out or run / "renders"
     with bar("Drawing") as show:
         render_run(avatar, read, folder, what, size, chunk, lambda done: show(done, ""))
@@ -177,11 +178,12 @@ def evaluate(
     """
     from twofold.capture.folder import read_capture
     from twofold.evaluate import evaluate as measure
-    from twofold.train.run import choose_device, find_capture, load
+    from twofold.train.run import choose_device, find_capture, load, require_same
 
     at_least(most=(most, 1), meshes=(meshes, 0))
     avatar, _ = load(run, choose_device(device))
     read = read_capture(find_capture(run, capture))
+    require_same(run, read, motion=True)
     count = sum(min(len(read.splits.get(s, ())), most or 10**9) for s in ("novel_view", "novel_pose"))
     done = 0
 

@@ -23,6 +23,7 @@ from twofold.train.run import (
     read_recipe,
     read_subject,
     require_free,
+    require_same,
     start_folder,
     write_checkpoint,
 )
@@ -199,6 +200,22 @@ def test_diverged_parameters_do_not_replace_a_good_checkpoint(run):
     with pytest.raises(TwofoldError, match="raw_beta is not finite at step 8"):
         write_checkpoint(run, avatar, optimizer, 8)
     assert (run / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_a_capture_of_somebody_else_is_refused_and_of_another_motion_where_that_matters(run, person):
+    for motion in (False, True):
+        require_same(run, person, motion)
+    taller = replace(person, betas=person.betas + 0.1)
+    for motion in (False, True):
+        with pytest.raises(TwofoldError, match=r"is not what .* was begun with \(betas differs\); name the capture"):
+            require_same(run, taller, motion)
+    with pytest.raises(TwofoldError, match=r"body weights differs"):
+        require_same(run, replace(person, body=replace(person.body, weights=person.body.weights.flip(1))), False)
+    frames = tuple(replace(frame, pose=frame.pose + 0.1) for frame in person.train)
+    moved = replace(person, splits=person.splits | {"train": frames})
+    require_same(run, moved, motion=False)
+    with pytest.raises(TwofoldError, match=r"poses differs"):
+        require_same(run, moved, motion=True)
 
 
 def test_capture_that_has_moved_is_asked_for(run, tmp_path):

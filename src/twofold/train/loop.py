@@ -33,6 +33,7 @@ from twofold.train.run import (
     read_checkpoint,
     read_subject,
     require_free,
+    require_same,
     start_folder,
     write_checkpoint,
 )
@@ -159,7 +160,9 @@ def train(
                 f"training.images_per_step is {config.images_per_step}, which {team.size} processes cannot share; "
                 "choose a multiple."
             )
-        subject = _begun_subject(folder, capture) if resume else Subject.of(capture)
+        if resume:
+            require_same(folder, capture, motion=True)
+        subject = read_subject(folder) if resume else Subject.of(capture)
         if not resume and team.leads:
             require_free(folder)
         avatar = recipe.method.build(subject, recipe.seed).to(device)
@@ -213,18 +216,6 @@ def train(
                 raise KeyboardInterrupt
         team.wait()
     return avatar.eval()
-
-
-def _begun_subject(folder: Path, capture: Capture) -> Subject:
-    """The subject of an interrupted run, if the capture still shows it."""
-    stored, shown = read_subject(folder).arrays(), Subject.of(capture).arrays()
-    changed = [name for name in stored if not np.array_equal(stored[name], shown.get(name, np.empty(0)))]
-    if changed:
-        raise TwofoldError(
-            f"{capture.folder} is not what {folder} was begun with ({changed[0]} differs); name the right capture or "
-            "start a new run."
-        )
-    return read_subject(folder)
 
 
 def _restore(folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer) -> int:

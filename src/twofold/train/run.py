@@ -10,6 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from twofold import __version__
 from twofold.capture.pixels import PixelConfig
+from twofold.capture.types import Capture
 from twofold.config import from_dict, to_dict
 from twofold.errors import TwofoldError
 from twofold.files import new_folder, plain_errors, read_json, read_npz, write_atomically, write_json, write_npz
@@ -195,6 +197,28 @@ def find_capture(folder: Path, given: Path | None = None, say: str = "--capture"
     if not Path(stored).is_dir():
         raise TwofoldError(f"The capture of {folder} is no longer at {stored}; say where it is with {say}.")
     return Path(stored)
+
+
+def require_same(folder: Path, capture: Capture, motion: bool) -> None:
+    """Says no to a capture that shows somebody else than a run was begun with.
+
+    Args:
+        folder: the run.
+        capture: that it is to go on with, or to be drawn or measured with.
+        motion: whether the training motion has to be the same, too. It has where corrections of poses are used, which
+            belong to moments; the avatar alone may take on any motion of its own body.
+
+    Raises:
+        TwofoldError: body, shape or, if asked for, motion differ.
+    """
+    stored, shown = read_subject(folder).arrays(), Subject.of(capture).arrays()
+    compared = [name for name in stored if motion or name == "betas" or name.startswith("body_")]
+    changed = [name for name in compared if not np.array_equal(stored[name], shown[name])]
+    if changed:
+        raise TwofoldError(
+            f"{capture.folder} is not what {folder} was begun with ({changed[0].replace('_', ' ')} differs); name the "
+            "capture that it was trained on, or train anew."
+        )
 
 
 def read_subject(folder: Path) -> Subject:
