@@ -1,37 +1,23 @@
 """Bad input gets one sentence and exit code 2, and leaves nothing half written."""
 
-import contextlib
 import functools
 import json
-import shlex
 import shutil
-import signal
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from disk import files_end_at
+from command_line import files, refused
 from PIL import Image
 from tiny_person import Run
 
-from twofold import console
 from twofold.cli import main
 from twofold.config import with_overrides
 from twofold.metrics import perceptual
 from twofold.recipes import RECIPES
 from twofold.train.run import read_checkpoint
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """What the command says on standard error when it ends with code 2."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    said = capsys.readouterr().err
-    assert ended.value.code == 2, said
-    assert "Traceback" not in said
-    return " ".join(said.split())
 
 
 def first(folder: Path, kind: str) -> Path:
@@ -139,6 +125,31 @@ def test_settings_come_in_one_list_or_one_by_one(words: list[str], capsys: pytes
     assert "training.pixels.rays=64" in text
 
 
+@pytest.mark.parametrize("seed", ["-1", "12345678901234567890123"])
+@pytest.mark.parametrize("command", ["studio", "train", "settings", "demo", "set"])
+def test_a_seed_that_no_generator_takes_is_refused_before_anything_is_written(
+    command: str, seed: str, person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = {
+        "studio": ["studio", out, "--seed", seed],
+        "train": ["train", person_folder, "--out", out, "--seed", seed],
+        "settings": ["train", "--settings", "--seed", seed],
+        "demo": ["demo", "--out", out, "--seed", seed],
+        "set": ["train", person_folder, "--out", out, "--set", f"seed={seed}"],
+    }[command]
+    said = refused(capsys, *words)
+    assert "seed" in said
+    assert "should be 0 to 4294967295" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_demo_does_not_take_the_place_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("mine")
+    assert f"Cannot write {tmp_path / 'file'}: " in refused(capsys, "demo", "--out", tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
 def test_an_unknown_device_is_named(person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "nonsense" in refused(capsys, "train", person_folder, "--out", tmp_path / "run", "--device", "nonsense")
 
@@ -182,117 +193,6 @@ def test_a_run_is_not_drawn_measured_or_continued_with_somebody_else(
     said = refused(capsys, command, *with_it)
     assert f"{other} is not what {run} was begun with (betas differs)" in said
     assert files(run) == before
-
-
-SMALL = [
-    "method.field.low_voxels=0.12,0.06", "method.field.high_voxels=0.04", "method.field.width=16",
-    "method.field.shared=8", "training.pixels.rays=64", "training.preview_every=2", "training.checkpoint_every=2",
-]  # fmt: skip
-
-
-def set_small(steps: int) -> list[str]:
-    return [word for setting in [*SMALL, f"training.steps={steps}"] for word in ("--set", setting)]
-
-
-def on_preview(monkeypatch: pytest.MonkeyPatch, act: Callable[[int], None]) -> None:
-    """Does something in the middle of a training, where a preview would be drawn."""
-    monkeypatch.setattr("twofold.outputs.gallery.save_preview", lambda avatar, capture, folder, step: act(step))
-
-
-def files(folder: Path) -> set[str]:
-    """What lies in a folder, TensorBoard's files apart, which have a name of their own in every run."""
-    every = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-    return {str(path) for path in every if path.parts[0] != "tensorboard"}
-
-
-def test_ctrl_c_stores_the_state_and_says_how_to_go_on_to_the_same_numbers(
-    person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    torch.set_num_threads(1)
-    on_preview(monkeypatch, lambda step: signal.raise_signal(signal.SIGINT) if step == 4 else None)
-    run = tmp_path / "my run"
-    with pytest.raises(SystemExit) as ended:
-        main(["train", str(person_folder), "--out", str(run), *set_small(7), "--device", "cpu"])
-    assert ended.value.code == 130
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert said == f"twofold: stopped. The training continues with: twofold train --resume '{run}' --device cpu"
-    assert read_checkpoint(run)[1] == 5
-    main(shlex.split(said.partition(" with: twofold ")[2]))
-    on_preview(monkeypatch, lambda step: None)
-    main(["train", str(person_folder), "--out", str(tmp_path / "whole"), *set_small(7), "--device", "cpu"])
-    (first, _), (second, _) = (read_checkpoint(folder) for folder in (run, tmp_path / "whole"))
-    assert first.keys() == second.keys()
-    assert all(torch.equal(tensor, second[name]) for name, tensor in first.items())
-
-
-def test_ctrl_c_before_anything_is_there_promises_nothing(
-    person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("twofold.train.loop.Subject.of", stop)
-    with pytest.raises(SystemExit) as ended:
-        main(["train", str(person_folder), "--out", str(tmp_path / "run")])
-    assert ended.value.code == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "twofold: stopped."
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_disk_that_fills_up_while_training_leaves_the_last_checkpoint(
-    person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = tmp_path / "run"
-    with contextlib.ExitStack() as disk:
-        on_preview(monkeypatch, lambda step: disk.enter_context(files_end_at(100_000)))
-        said = refused(capsys, "train", person_folder, "--out", run, *set_small(5))
-    assert f"Cannot write {run / 'checkpoint.safetensors'}" in said
-    assert read_checkpoint(run)[1] == 2
-    assert files(run) == {"checkpoint.safetensors", "curves.csv", "recipe.json", "run.json", "subject.npz"}
-    on_preview(monkeypatch, lambda step: None)
-    main(["train", "--resume", str(run)])
-    assert read_checkpoint(run)[1] == 5
-
-
-def test_a_disk_that_is_full_at_the_start_gets_no_run(
-    person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with files_end_at(1000):
-        said = refused(capsys, "train", person_folder, "--out", tmp_path / "runs" / "first", *set_small(2))
-    assert f"Cannot write {tmp_path / 'runs' / 'first'}" in said
-    assert "partial" not in said
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("what", ["canonical", "views", "orbit"])
-def test_a_full_disk_ends_drawing_without_half_a_picture(
-    what: str, trained: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with files_end_at(1000):
-        said = refused(capsys, "render", trained.folder, "--what", what, "--size", 16, "--out", tmp_path / "out")
-    assert f"Cannot write {tmp_path / 'out'}" in said
-    assert not [name for name in files(tmp_path) if "partial" in name or (tmp_path / name).stat().st_size >= 1000]
-
-
-def test_a_full_disk_ends_measuring_and_leaves_the_last_figures(
-    trained: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copytree(trained.folder, tmp_path / "run")
-    (tmp_path / "run" / "metrics.json").write_text("{}")
-    before = files(tmp_path)
-    with files_end_at(100):
-        said = refused(capsys, "evaluate", tmp_path / "run", "--most", 1, "--meshes", 0)
-    assert f"Cannot write {tmp_path / 'run' / 'metrics.json'}" in said
-    assert files(tmp_path) == before
-    assert (tmp_path / "run" / "metrics.json").read_text() == "{}"
-
-
-def test_a_full_disk_ends_filming_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("anny")
-    with files_end_at(500):
-        said = refused(capsys, "studio", tmp_path / "mine", "--size", 32, "--frames", 4, "--cameras", 1)
-    assert f"Cannot write {tmp_path / 'mine'}" in said
-    assert list(tmp_path.iterdir()) == []
 
 
 def write_small_lpips(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -345,30 +245,6 @@ def test_a_place_below_a_file_cannot_be_written(
     arguments = [out] if command == "studio" else [trained.folder, "--out", out, "--what", "views"]
     assert f"Cannot write {out}" in refused(capsys, command, *arguments)
     assert (tmp_path / "file").read_text() == "mine"
-
-
-def test_a_line_tells_of_progress_every_tenth_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    with console.bar("Working") as show:
-        for step in range(41):
-            show(step / 40, f"step {step}")
-    lines = capsys.readouterr().err.splitlines()
-    assert [line.split(",")[0] for line in lines] == [f"Working: {10 * tenth} %" for tenth in range(1, 11)]
-    assert [line.split(", ")[-1] for line in lines] == [f"step {4 * tenth}" for tenth in range(1, 11)]
-
-
-def test_a_line_tells_of_slow_progress_now_and_then_and_how_long_it_will_take(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = 1000.0
-    for clock in ("time.monotonic", "rich.console.monotonic"):
-        monkeypatch.setattr(clock, lambda: now)
-    with console.bar("Working") as show:
-        for step in range(100):
-            show(step / 1000, "")
-            now += 10
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 33
-    assert lines[-1].startswith("Working: 10 %, 2:30:")
 
 
 def test_the_settings_of_a_recipe_are_shown_and_each_can_be_set(capsys: pytest.CaptureFixture[str]) -> None:

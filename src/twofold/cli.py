@@ -8,7 +8,6 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -92,7 +91,7 @@ def _show_settings(recipe: Recipes, overrides: tuple[str, ...], seed: int) -> No
     from twofold.config import describe, with_overrides
     from twofold.recipes import RECIPES
 
-    lines = describe(with_overrides(replace(RECIPES[recipe](), seed=seed), overrides))
+    lines = describe(with_overrides(RECIPES[recipe](), [f"seed={seed}", *overrides]))
     try:
         print("\n".join(lines), flush=True)
     except BrokenPipeError:  # whoever reads, `head` say, has seen enough
@@ -111,7 +110,7 @@ def _new_run(
         raise TwofoldError("Expected a capture folder (`twofold train CAPTURE`) or --resume RUN; neither was given.")
     folder = out or Path("runs") / f"{capture.resolve().name}-{recipe}"
     require_free(folder)
-    return with_overrides(replace(RECIPES[recipe](), seed=seed), overrides), folder, capture
+    return with_overrides(RECIPES[recipe](), [f"seed={seed}", *overrides]), folder, capture
 
 
 def _attach_lpips(avatar: object) -> str | None:

@@ -23,6 +23,8 @@ from twofold.errors import TwofoldError
 
 T = TypeVar("T")
 KIND = "kind"
+MOST_SEED = 2**32 - 1
+"""Seeds are 0 to this: what every generator takes, and a sine of it still tells neighbours apart."""
 
 
 def to_dict(config: object) -> dict[str, Any]:

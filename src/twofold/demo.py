@@ -13,7 +13,7 @@ from twofold.capture.studio import StudioConfig, make_studio
 from twofold.capture.types import Capture, Frame, spread
 from twofold.errors import TwofoldError
 from twofold.evaluate import evaluate, with_protocols
-from twofold.files import write_json
+from twofold.files import plain_errors, write_json
 from twofold.methods.base import Avatar
 from twofold.metrics.image import to_8bit
 from twofold.outputs.charts import Chart, Curve
@@ -55,8 +55,9 @@ def run_demo(out: Path, seed: int, show: Callable[[float, str], None]) -> Path:
     Raises:
         TwofoldError: `out` holds something else, or cannot be written.
     """
-    if out.exists() and any(out.iterdir()) and not (out / "capture" / "capture.json").is_file():
-        raise TwofoldError(f"{out} holds something that is no demo; choose another --out or empty it.")
+    with plain_errors(out):
+        if out.exists() and any(out.iterdir()) and not (out / "capture" / "capture.json").is_file():
+            raise TwofoldError(f"{out} holds something that is no demo; choose another --out or empty it.")
     begun = time.monotonic()
     seconds: dict[str, float] = {}
 

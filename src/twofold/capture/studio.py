@@ -27,6 +27,7 @@ from twofold.capture.studio_look import Look, draw_look
 from twofold.capture.studio_motion import choreograph
 from twofold.capture.studio_paint import paint
 from twofold.capture.studio_scene import ring, room, spoil_mask
+from twofold.config import MOST_SEED
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.raster import box_filter, rasterize, supersampled
@@ -59,7 +60,13 @@ class StudioConfig:
     samples: int = 3
 
     def __post_init__(self) -> None:
-        limits = {"size": (16, 4096), "frames": (4, 100_000), "cameras": (1, 100), "samples": (1, 16)}
+        limits = {
+            "seed": (0, MOST_SEED),
+            "size": (16, 4096),
+            "frames": (4, 100_000),
+            "cameras": (1, 100),
+            "samples": (1, 16),
+        }
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
                 raise TwofoldError(

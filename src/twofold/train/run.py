@@ -19,7 +19,7 @@ from torch import Tensor
 from twofold import __version__
 from twofold.capture.pixels import PixelConfig
 from twofold.capture.types import Capture
-from twofold.config import from_dict, to_dict
+from twofold.config import MOST_SEED, from_dict, to_dict
 from twofold.errors import TwofoldError
 from twofold.files import new_folder, plain_errors, read_json, read_npz, write_atomically, write_json, write_npz
 from twofold.methods.base import Avatar, Subject
@@ -83,6 +83,11 @@ class Recipe:
     method: FactorizedConfig = FactorizedConfig()
     training: TrainingConfig = TrainingConfig()
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuses seeds that not every generator takes."""
+        if not 0 <= self.seed <= MOST_SEED:
+            raise ValueError(f"seed={self.seed} should be 0 to {MOST_SEED}")
 
 
 def choose_device(name: str) -> torch.device:
