@@ -58,7 +58,7 @@ def import_capture(
     from twofold.capture.prepared import import_prepared
 
     import_prepared(source, out, held_out, drop_below_iou, held_objects=held_objects)
-    say(f"The capture is in {out}.", f"twofold train {out}")
+    say(f"The capture is in {out}.", f"twofold check {out}")
 
 
 def prepare(

@@ -145,7 +145,7 @@ def test_an_interrupted_or_unfinished_capture_leaves_nothing(tmp_path):
 
 def test_a_capture_is_overwritten_only_on_request(tiny):
     before = every_file(tiny)
-    with pytest.raises(TwofoldError, match="already holds a capture; choose another name or overwrite it"):
+    with pytest.raises(TwofoldError, match="already holds a capture; choose another name or remove that one first"):
         write_tiny(tiny)
     assert every_file(tiny) == before
     write_tiny(tiny, overwrite=True, name="second")

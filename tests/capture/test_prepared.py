@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -205,6 +206,49 @@ def test_a_faulty_prepared_capture_is_one_sentence_and_leaves_nothing(prepared, 
     with pytest.raises(TwofoldError, match=sentence) as caught:
         import_prepared(folder, tmp_path / "out", drop_below_iou=0.1 if "silhouette_iou" in changes else 0.0)
     assert len(str(caught.value).splitlines()) == 1
+    assert os.listdir(tmp_path) == ["broken"]
+
+
+def no_picture(file):
+    file.write_bytes(b"no picture")
+
+
+def nobody(file):
+    Image.new("L", (WIDTH, HEIGHT)).save(file)
+
+
+@pytest.mark.parametrize("held_objects", ["remove", "keep"])
+@pytest.mark.parametrize(
+    ("name", "spoil", "sentence"),
+    [
+        ("images/0000.jpg", no_picture, "cannot be read as a picture; save it again"),
+        ("images/0003.jpg", no_picture, "cannot be read as a picture; save it again|no readable picture"),
+        ("masks/0003.png", no_picture, "cannot be read as a picture; save it again|no readable picture"),
+        ("masks/0003.png", nobody, "is all black, so nobody is there"),
+    ],
+)
+def test_a_bad_picture_is_named_as_it_was_given(prepared, tmp_path, name, spoil, sentence, held_objects):
+    folder = shutil.copytree(prepared, tmp_path / "given")
+    spoil(folder / name)
+    with pytest.raises(TwofoldError, match=sentence) as caught:
+        import_prepared(folder, tmp_path / "out", held_objects=held_objects)
+    assert str(folder / name) in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+    assert os.listdir(tmp_path) == ["given"]
+
+
+@pytest.mark.parametrize("threshold", [2.0, -0.1, float("nan")])
+def test_a_threshold_that_no_iou_can_have_is_refused(prepared, tmp_path, threshold):
+    with pytest.raises(TwofoldError, match="IoU of 0 to 1, not below"):
+        import_prepared(prepared, tmp_path / "out", drop_below_iou=threshold)
+
+
+def test_a_body_that_stands_a_thousand_times_too_far_away_is_refused(juggler, tmp_path):
+    source, _ = juggler
+    with np.load(source / "capture.npz") as arrays:
+        far = broken(source, tmp_path, transl=1000 * arrays["transl"])
+    with pytest.raises(TwofoldError, match=r"masks/0000\.png shows a person of .* pixels, the posed body has 0\.\d"):
+        import_prepared(far, tmp_path / "out")
     assert os.listdir(tmp_path) == ["broken"]
 
 

@@ -98,7 +98,7 @@ def poses(time, value):
         ({"betas": np.full(1, 99.0)}, "betas should make a body of 0.3 to 3 metres, it measures"),
         ({"betas": np.zeros(2)}, "there are 2 betas, the body takes 1 at most"),
         ({"true_poses": np.zeros((5, 24, 3))}, "true_poses should be"),
-        ({"translations": np.full((6, 3), 1000.0, np.float32) * [0, 0, 1]}, "has the body behind it"),
+        ({"translations": np.full((6, 3), 10.0, np.float32) * [0, 0, 1]}, "has the body behind it"),
     ],
 )
 def test_a_fault_of_the_motion_is_named(tiny, move, arrays, sentence):
@@ -197,6 +197,16 @@ def test_a_mask_of_somewhere_else_is_named(tiny):
     mask[:, :2] = 255  # the right rows, the wrong columns
     Image.fromarray(mask).save(tiny / "masks/front/000001.png")
     assert "masks/front/000001.png and the posed body do not meet" in only(validate(tiny))
+
+
+def test_a_body_in_other_units_is_named(tiny, move):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, 0] = 0
+    Image.fromarray(mask).save(tiny / "masks/front/000001.png")
+    translations = tiny_motion()[1].numpy()
+    translations[1] = (0, 0, -1000)
+    move(translations=translations)
+    assert "masks/front/000001.png shows a person of 46 pixels, the posed body has 0.1; check" in only(validate(tiny))
 
 
 def test_a_bad_mesh_is_named(tiny):

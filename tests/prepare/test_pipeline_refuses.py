@@ -113,7 +113,7 @@ def test_what_lies_there_is_overwritten_only_if_asked_and_if_all_goes_well(tmp_p
     before = content(out)
     again = partial(prepare, stage.clips, out, stage.body)
     calls = []
-    with pytest.raises(TwofoldError, match="already holds a capture; choose another name or overwrite it"):
+    with pytest.raises(TwofoldError, match="already holds a capture; choose another name or remove that one first"):
         again(lambda: calls.append(1), PLAIN)
     assert not calls  # known before any work
     stage.finders.clear()

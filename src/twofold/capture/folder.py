@@ -33,7 +33,7 @@ from twofold.capture.contents import (
     read_contents,
 )
 from twofold.capture.types import SPLITS, Capture, Frame
-from twofold.capture.validate import quick_faults, require
+from twofold.capture.validate import pixel_faults, quick_faults, require
 from twofold.errors import TwofoldError
 from twofold.files import new_folder, plain_errors, read_npz, write_json, write_npz
 from twofold.geometry.cameras import Camera
@@ -181,6 +181,7 @@ class CaptureWriter:
         true_poses: Float[Tensor, "T 24 3"] | None = None,
         true_translations: Float[Tensor, "T 3"] | None = None,
         notes: Mapping[str, Any] | None = None,
+        thorough: bool = False,
     ) -> None:
         """Writes the small files, last of all, and checks the whole.
 
@@ -198,6 +199,7 @@ class CaptureWriter:
             true_poses: where `poses` were disturbed, what they were.
             true_translations: likewise.
             notes: anything worth keeping about how it was made (numbers, texts, lists); nothing reads it.
+            thorough: also judges the pixels of every picture, for pictures that nobody has looked at yet.
 
         Raises:
             TwofoldError: what was written is no valid capture; all is removed again.
@@ -224,7 +226,8 @@ class CaptureWriter:
         }
         write_json(folder / DESCRIPTION, description | ({"notes": dict(notes)} if notes else {}))
         contents, faults = read_contents(folder)
-        require(faults + quick_faults(contents), self._folder)
+        faults += quick_faults(contents)
+        require(faults + (pixel_faults(contents) if thorough else []), self._folder)
         self._finished = True
 
     def _may_replace(self) -> bool:
@@ -239,7 +242,7 @@ class CaptureWriter:
             raise TwofoldError(f"The folder {self._folder} holds {holds}; choose another name.")
         if not self._overwrite:
             raise TwofoldError(
-                f"The folder {self._folder} already holds a capture; choose another name or overwrite it."
+                f"The folder {self._folder} already holds a capture; choose another name or remove that one first."
             )
         return True
 

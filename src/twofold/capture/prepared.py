@@ -4,7 +4,9 @@ The fitted body comes in a rest pose of its own, its arms hanging at an angle; i
 T-pose. The world is turned from the camera's axes to y up.
 """
 
-from collections.abc import Iterator
+import contextlib
+import re
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,7 +19,7 @@ from torch import Tensor
 
 from twofold.body.retarget import convert_pose, straighten
 from twofold.body.skeleton import PARENTS, Body, pose_body, require_surface, shape_body
-from twofold.capture.contents import spans
+from twofold.capture.contents import IMAGES, MASKS, file_stem, spans
 from twofold.capture.folder import CaptureWriter
 from twofold.capture.masks import SeenBody, see_body, usual_colors, without_objects
 from twofold.errors import TwofoldError
@@ -79,9 +81,14 @@ def import_prepared(
         `out`.
 
     Raises:
-        TwofoldError: an array or picture is missing or of the wrong shape, or `out` cannot be written.
+        TwofoldError: an array or picture is missing or of the wrong shape, a picture or mask cannot be read or does not
+            show the fitted body, or `out` cannot be written; nothing is left behind then.
     """
     source, out = Path(source), Path(out)
+    if not 0 <= drop_below_iou <= 1:
+        raise TwofoldError(
+            f"Frames are left out below an IoU of 0 to 1, not below {drop_below_iou:g}; give such a number."
+        )
     if every_held_out < 3:
         raise TwofoldError(f"One frame of {every_held_out} cannot be held out between two that train; take 3 or more.")
     arrays = _read_arrays(source)
@@ -90,12 +97,11 @@ def import_prepared(
     images, masks = _pictures(source / "images", kept), _pictures(source / "masks", kept)
     world_to_camera = torch.as_tensor(arrays["world_to_camera"].astype(np.float64))
     poses, translations, world_to_camera = turn_world(Y_UP, body.joints[0], poses, translations, world_to_camera)
-    with Image.open(images[kept[0]]) as picture:
-        width, height = picture.size
+    height, width = _pixels(images[kept[0]], "RGB").shape[:2]
     camera = Camera(world_to_camera.float(), torch.as_tensor(arrays["intrinsics"].astype(np.float32)), height, width)
     held_out = [time for time in kept if time % every_held_out == every_held_out // 2]
     origin = origin or ORIGINS.get(source.name, Origin(30.0, ""))
-    with CaptureWriter(out, overwrite) as writer:
+    with _named_as_given(images, masks), CaptureWriter(out, overwrite) as writer:
         for time in kept:
             writer.image_file(CAMERA, time, images[time])
         shares = dict.fromkeys(kept, 0.0)
@@ -133,8 +139,22 @@ def import_prepared(
                 "video_frame": arrays["video_frame"].tolist(),
                 "silhouette_iou": [round(float(iou), 3) for iou in arrays["silhouette_iou"]],
             },
+            thorough=True,
         )
     return out
+
+
+@contextlib.contextmanager
+def _named_as_given(images: dict[int, Path], masks: dict[int, Path]) -> Generator[None, None, None]:
+    """Faults of pictures under the names that they have in the prepared folder, where they can be mended."""
+    try:
+        yield
+    except TwofoldError as error:
+        text = str(error)
+        for kind, files in ((IMAGES, images), (MASKS, masks)):
+            for time, file in files.items():
+                text = re.sub(rf"\b{kind}/{CAMERA}/{file_stem(time)}\.\w+", lambda _, file=file: str(file), text)
+        raise TwofoldError(text) from error
 
 
 def _without_objects(
@@ -173,8 +193,16 @@ def _without_objects(
 
 
 def _pixels(file: Path, mode: Literal["L", "RGB"]) -> UInt8[np.ndarray, "h w *c"]:
-    with Image.open(file) as picture:
-        return np.asarray(picture.convert(mode))
+    """A picture's bytes.
+
+    Raises:
+        TwofoldError: it cannot be decoded.
+    """
+    try:
+        with Image.open(file) as picture:
+            return np.asarray(picture.convert(mode))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise TwofoldError(f"{file} cannot be read as a picture; save it again.") from error
 
 
 def turn_world(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -39,6 +39,8 @@ _MEANINGS = {
     MASKS: "one 8-bit channel, 0 outside and 255 on the person",
     IGNORED: "one 8-bit channel, 255 where nothing is known of the person",
 }
+_FAR_TOO_SMALL = 0.1
+"""A body whose joints span less than this share of its mask is given in other units, or far away."""
 _PERSON = 128
 """Masks count as the person from here on, when a whole mask is judged."""
 
@@ -151,13 +153,13 @@ def pixel_faults(contents: Contents) -> list[str]:
     faults: list[str] = []
     for name, times in contents.pictures.items():
         images, masks = contents.files(IMAGES, name), contents.files(MASKS, name)
-        visible, size = dict[int, np.ndarray](), (0, 0)
+        shown, size = dict[int, ShownJoints](), (0, 0)
         if name in contents.cameras:
             camera = contents.cameras[name]
             size = (camera.height, camera.width)
-            visible = {} if joints is None else _visible_joints(joints, camera)
+            shown = {} if joints is None else _shown_joints(joints, camera)
         faults += _in_threads(partial(_decoding_fault, contents.folder), [images[t] for t in times if t in images])
-        with_joints = [(masks[t], visible.get(t)) for t in times if t in masks]
+        with_joints = [(masks[t], shown.get(t)) for t in times if t in masks]
         faults += _in_threads(partial(_mask_fault, contents.folder, size), with_joints)
         ignored = contents.files(IGNORED, name)
         pairs = [(ignored[t], masks[t]) for t in times if t in ignored and t in masks]
@@ -165,11 +167,19 @@ def pixel_faults(contents: Contents) -> list[str]:
     return faults
 
 
-def _visible_joints(joints: Float[Tensor, "T 24 3"], camera: Camera) -> dict[int, np.ndarray]:
-    """Pixels (column, row) of the joints inside the picture, by time."""
+class ShownJoints(NamedTuple):
+    """Pixels (column, row) of the joints inside a picture, and how far all of them reach, pixels."""
+
+    inside: np.ndarray
+    reach: float
+
+
+def _shown_joints(joints: Float[Tensor, "T 24 3"], camera: Camera) -> dict[int, ShownJoints]:
+    """By time."""
     pixels, depths = project(camera, joints)
     inside = _in_picture(pixels, camera) & (depths > 0)
-    return {time: pixels[time][inside[time]].numpy() for time in range(len(joints))}
+    reach = (pixels.amax(1) - pixels.amin(1)).amax(-1)
+    return {time: ShownJoints(pixels[time][inside[time]].numpy(), float(reach[time])) for time in range(len(joints))}
 
 
 def _decoding_fault(folder: Path, path: Path) -> str:
@@ -187,13 +197,13 @@ def _decoding_fault(folder: Path, path: Path) -> str:
     return ""
 
 
-def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, np.ndarray | None]) -> str:
+def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, ShownJoints | None]) -> str:
     """What is wrong with one mask.
 
     Args:
         folder: the capture's.
         size: height and width that it should have.
-        item: its file, and the visible joints in pixels (column, row), None where they are not known.
+        item: its file, and the joints in the picture, None where they are not known.
     """
     path, joints = item
     damaged = _decoding_fault(folder, path)
@@ -214,10 +224,16 @@ def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, np.ndarra
             f"{where} is all white, as if the person filled the picture; mend it or take this time out of the splits."
         )
     columns, rows = np.flatnonzero((mask >= _PERSON).any(0)), np.flatnonzero((mask >= _PERSON).any(1))
-    if joints is not None and len(joints) and mask.shape == size:
+    if joints is not None and len(joints.inside) and mask.shape == size:
         low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]])
-        if not ((joints >= low) & (joints <= high)).all(-1).any():
+        if not ((joints.inside >= low) & (joints.inside <= high)).all(-1).any():
             return f"{where} and the posed body do not meet; check that mask, pose and camera are of the same moment."
+        tall = float((high - low).max())
+        if joints.reach < _FAR_TOO_SMALL * tall:
+            return (
+                f"{where} shows a person of {tall:.0f} pixels, the posed body has {joints.reach:.1f}; check the "
+                "translations and the camera's (metres), and its focal length (pixels)."
+            )
     return ""
 
 
