@@ -89,6 +89,37 @@ def describe(config: object) -> list[str]:
     return [f"{left:<{width}}  {text}" if text else left for left, text in rows]
 
 
+def require_within(config: object, **limits: tuple[int | float, int | float]) -> None:
+    """Refuses settings outside the least and the most that make sense; None passes, lists are held to it one by one.
+
+    >>> @dataclasses.dataclass(frozen=True)
+    ... class Training:
+    ...     steps: int = 200
+    ...     def __post_init__(self) -> None:
+    ...         require_within(self, steps=(1, 1000))
+    >>> Training(0)
+    Traceback (most recent call last):
+    ValueError: steps=0 should be 1 to 1000
+
+    Raises:
+        ValueError: one or several are outside; all are named.
+    """
+    wrong = []
+    for name, (least, most) in limits.items():
+        value = getattr(config, name)
+        numbers = value if isinstance(value, tuple) else () if value is None else (value,)
+        if not all(least <= number <= most for number in cast(tuple[int | float, ...], numbers)):
+            text = _shown(value)
+            given = text if len(text) <= 40 else f"{text[:30]}..."
+            wrong.append(f"{name}={given} should be {_plain(least)} to {_plain(most)}")
+    if wrong:
+        raise ValueError("; ".join(wrong))
+
+
+def _plain(number: int | float) -> str:
+    return str(int(number)) if number == int(number) else f"{number:g}"
+
+
 def _to_json(value: object, annotation: object) -> object:
     if _is_config(value):
         several = sum(dataclasses.is_dataclass(c) for c in _choices(annotation)) > 1

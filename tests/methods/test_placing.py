@@ -87,9 +87,9 @@ def test_training_asks_about_every_sample(dense, person, looking):
     dense.eval()
 
 
-@pytest.mark.parametrize("wrong", [{"radius": 0.0}, {"step": -1.0}, {"table_voxel": -0.1}])
+@pytest.mark.parametrize("wrong", [{"radius": 0.0}, {"step": -1.0}, {"table_voxel": -0.1}, {"table_voxel": 1e-3}])
 def test_sizes_that_leave_nothing_to_sample_are_refused(wrong):
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(ValueError, match=r"(radius|step|table_voxel)=.* should be 0"):
         ShellSampler(**wrong)
 
 

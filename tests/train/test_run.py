@@ -11,7 +11,7 @@ from tiny_person import tiny_recipe
 from twofold.config import with_overrides
 from twofold.errors import TwofoldError
 from twofold.methods.base import Subject
-from twofold.recipes import released
+from twofold.recipes import quick, released
 from twofold.train.loop import make_optimizer
 from twofold.train.run import (
     choose_device,
@@ -246,12 +246,33 @@ def test_automatic_device_is_the_gpu_where_there_is_one():
         "training.steps=0", "training.images_per_step=0", "training.rate_low=-1", "training.checkpoint_every=0",
         "training.preview_every=-1", "training.adam_betas=0.9,1.0", "training.clip=-1", "training.steps=many",
         "method.sampler.refined=1", "method.neighbours=0", "method.beta=0", "method.losses.mask=-0.1",
-        "method.shell_refresh=0",
+        "method.shell_refresh=0", "training.steps=1e99", "training.pixels.rays=-1", "training.pixels.rays=0",
+        "training.pixels.rays=99999999999", "training.pixels.subject_share=3", "training.pixels.patches=-1",
+        "training.pixels.patch_size=0", "training.decay=0", "training.decay_from=2", "method.outlier_distance=-1",
+        "method.neighbours=999999", "method.pose.drop=7", "method.pose.zero_until=-1", "method.field.width=0",
+        "method.field.low_octaves=-1", "method.field.low_sdf_depth=0", "method.losses.eikonal_points=99999999999",
+        "method.losses.lpips_start=-1", "method.sampler.refined=99999999999", f"training.steps=1{400 * '0'}",
     ],
 )  # fmt: skip
 def test_settings_with_which_nothing_can_be_trained_are_refused_by_name(setting):
     with pytest.raises(TwofoldError) as error:
         with_overrides(released(), [setting])
+    assert setting.partition("=")[0].rpartition(".")[2] in sentence(error)
+    assert len(sentence(error)) < 200
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "method.field.low_voxels=0", "method.field.low_voxels=", "method.field.low_voxels=0.1,1e-9",
+        "method.field.high_voxels=", "method.field.features=0", "method.field.shared=0", "method.field.pose_code=0",
+        "method.field.radius=99", "method.field.gate_width=0", "method.sampler.voxel=1e-9", "method.sampler.step=1e-7",
+        "method.sampler.table_voxel=1e-5", "method.sampler.radius=0",
+    ],
+)  # fmt: skip
+def test_grids_and_shells_that_fill_any_memory_or_hold_nothing_are_refused_by_name(setting):
+    with pytest.raises(TwofoldError) as error:
+        with_overrides(quick(), [setting])
     assert setting.partition("=")[0].rpartition(".")[2] in sentence(error)
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from twofold.body.skeleton import Body, pose_body, shape_body
 from twofold.capture.types import Frame
+from twofold.config import require_within
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Rays, pixel_rays, project
 
@@ -30,6 +31,13 @@ class PixelConfig:
     """Edge of a patch, pixels."""
     patch_on_subject: float = 0.9
     """Probability that a patch is centred on the subject."""
+
+    def __post_init__(self) -> None:
+        """Refuses choices with which no picture gives pixels, or more than any machine takes."""
+        require_within(
+            self, rays=(1, 1_000_000), subject_share=(0, 1), surroundings=(0, 10_000), patches=(0, 1000),
+            patch_size=(1, 1024), patch_on_subject=(0, 1),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from twofold.config import require_within
 from twofold.field.branches import Branch, BranchNetworks, Geometry, ReadyBranch
 from twofold.field.encoding import encoding_size, fourier_encoding
 from twofold.field.networks import NetworkConfig, Precision
@@ -81,7 +82,12 @@ class FactorizedFieldConfig:
     hidden_dtype: Precision = "float32"
 
     def __post_init__(self) -> None:
-        """Refuses options that exclude each other."""
+        """Refuses sizes that no network has, and options that exclude each other."""
+        depths = {name: (1, 64) for name in vars(self) if name.endswith("_depth")}
+        require_within(
+            self, low_octaves=(0, 20), high_octaves=(0, 20), pose_code=(1, 1024), feature_code=(1, 1024),
+            width=(1, 4096), radius=(0.01, 3), **depths,
+        )  # fmt: skip
         if self.branches == "high" and self.pose_into == "low":
             raise ValueError('branches="high" leaves out the branch of pose_into="low"; set pose_into="high"')
         if self.branches == "high_rendered" and not self.share_features:

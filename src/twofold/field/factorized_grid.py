@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from twofold.body.skeleton import PosedBody
+from twofold.config import require_within
 from twofold.field.grids import (
     FeatureGrid,
     Lattices,
@@ -51,6 +52,15 @@ class GridFieldConfig:
     """Whether the high branch sees the low branch's features; off is the ablation "w/o feat"."""
     pose_into: Literal["high", "low"] = "high"
     """Which branch sees the pose; "low" is the ablation "Pose_lf"."""
+
+    def __post_init__(self) -> None:
+        """Refuses grids without levels or numbers, and those that fill any memory."""
+        if not self.low_voxels or not self.high_voxels:
+            raise ValueError("low_voxels and high_voxels should each name a spacing or several")
+        require_within(
+            self, low_voxels=(0.003, 1), high_voxels=(0.003, 1), features=(1, 64), width=(1, 1024), shared=(1, 256),
+            pose_code=(1, 1024), radius=(0.005, 0.5), gate_width=(1e-4, 10),
+        )  # fmt: skip
 
     def build(self, body: PosedBody, pose_size: int = 69, generator: torch.Generator | None = None) -> "GridField":
         """A field around `body` in its canonical pose."""

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from twofold import losses
 from twofold.body.skeleton import PosedBody, ShapedBody, pose_body, shape_body
 from twofold.capture.pixels import Batch
+from twofold.config import require_within
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.deform.shell import Shell, build_shell
 from twofold.deform.skinning import to_canonical, vertex_transforms
@@ -36,6 +37,9 @@ from twofold.metrics.perceptual import LPIPS
 from twofold.speed import compiled_methods
 from twofold.volume.rendering import composite, composite_weights, laplace_density
 from twofold.volume.samplers import ErrorBoundedSampler
+
+MOST_STEPS = 10**12
+"""No training takes so many; a step of it means never."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +66,12 @@ class LossConfig:
     def __post_init__(self) -> None:
         """Refuses weights that reward what they should punish."""
         weights = (self.eikonal, self.common, self.lpips, self.mask, self.s3im)
-        right = min(weights) >= 0 < self.reconstruction and self.eikonal_points > 0
-        _require(right, "weights should not be negative, reconstruction and eikonal_points positive")
+        right = min(weights) >= 0 < self.reconstruction
+        _require(right, "weights should not be negative, reconstruction positive")
+        require_within(
+            self, reconstruction=(0, 1e6), eikonal=(0, 1e6), common=(0, 1e6), lpips=(0, 1e6), mask=(0, 1e6),
+            s3im=(0, 1e6), lpips_start=(0, MOST_STEPS), eikonal_points=(1, 1_000_000), eikonal_spread=(0, 1),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -82,6 +90,11 @@ class PoseConfig:
     refine: tuple[Literal["root", "body", "translation", "shape"], ...] = ("root", "body", "translation", "shape")
     refine_from: int = 0
     """First step at which poses are corrected."""
+
+    def __post_init__(self) -> None:
+        """Refuses chances and steps that there are not."""
+        steps = (0, MOST_STEPS)
+        require_within(self, zero_until=steps, zero_every=steps, drop=(0, 1), refine_from=steps)
 
 
 @dataclass(frozen=True)
@@ -111,7 +124,9 @@ class FactorizedConfig:
 
     def __post_init__(self) -> None:
         """Refuses options that exclude each other."""
-        _require(self.neighbours > 0 < self.shell_refresh, "neighbours and shell_refresh should be at least 1")
+        require_within(
+            self, neighbours=(1, 64), shell_refresh=(1, MOST_STEPS), outlier_distance=(0.001, 10), beta=(0, 10)
+        )
         _require(0 < self.beta_floor < self.beta, f"beta_floor should lie between 0 and beta={self.beta}")
         if isinstance(self.field, GridFieldConfig) and isinstance(self.sampler, ShellSampler):
             within = self.sampler.radius <= self.field.radius

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from twofold.config import require_within
 from twofold.deform.shell import nearest_listed, sample_shell
 from twofold.deform.skinning import neighbour_weights, to_canonical
 from twofold.field.distance_table import DistanceTable
@@ -40,8 +41,12 @@ class ShellSampler:
 
     def __post_init__(self) -> None:
         """Refuses sizes that leave nothing to sample."""
-        if min(self.radius, self.step, self.voxel) <= 0 or self.table_voxel < 0:
-            raise ValueError("radius, step and voxel should be positive, table_voxel not negative")
+        # The voxels of a body fill half a gigabyte at the least edge; a ray crosses it in a thousand steps.
+        require_within(
+            self, radius=(0.005, 0.5), step=(0.001, 0.5), voxel=(0.005, 0.5), least_weight=(0, 1), table_voxel=(0, 0.5)
+        )
+        if 0 < self.table_voxel < 0.004:
+            raise ValueError(f"table_voxel={self.table_voxel:g} should be 0.004 to 0.5, or 0 for no table")
 
 
 @dataclass(frozen=True)

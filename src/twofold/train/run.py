@@ -1,6 +1,5 @@
 """A run: its recipe, its folder, its checkpoints. Everything later starts at `load`."""
 
-import math
 import os
 import platform
 import shutil
@@ -19,7 +18,7 @@ from torch import Tensor
 from twofold import __version__
 from twofold.capture.pixels import PixelConfig
 from twofold.capture.types import Capture
-from twofold.config import MOST_SEED, from_dict, to_dict
+from twofold.config import MOST_SEED, from_dict, require_within, to_dict
 from twofold.errors import TwofoldError
 from twofold.files import new_folder, plain_errors, read_json, read_npz, write_atomically, write_json, write_npz
 from twofold.methods.base import Avatar, Subject
@@ -64,15 +63,15 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         """Refuses numbers with which nothing can be trained."""
-        whole = {n: getattr(self, n) for n in ("steps", "images_per_step", "checkpoint_every")}
-        numbers = {n: getattr(self, n) for n in vars(self) if n.startswith("rate_")}
-        numbers |= {n: getattr(self, n) for n in ("warmup", "decay", "decay_from", "clip", "preview_every")}
-        wrong = [f"{n}={v} should be at least 1" for n, v in whole.items() if v < 1]
-        wrong += [f"{n}={v} should be finite and not negative" for n, v in numbers.items() if not 0 <= v < math.inf]
-        if not all(0 <= beta < 1 for beta in self.adam_betas) or self.adam_epsilon < 0:
-            wrong.append("adam_betas should lie in 0..1, below 1, and adam_epsilon should not be negative")
-        if wrong:
-            raise ValueError("; ".join(wrong))
+        most = 100_000_000
+        rates = {name: (0, 1000) for name in vars(self) if name.startswith("rate_")}
+        require_within(
+            self, steps=(1, most), images_per_step=(1, 1000), checkpoint_every=(1, most), preview_every=(0, most),
+            warmup=(0, most), milestones=(0, most), decay=(1e-9, 1), decay_from=(0, 1), clip=(0, 1e6),
+            adam_epsilon=(0, 1), **rates,
+        )  # fmt: skip
+        if not all(0 <= beta < 1 for beta in self.adam_betas):
+            raise ValueError(f"adam_betas={self.adam_betas} should lie in 0..1, below 1")
 
 
 @dataclass(frozen=True)
@@ -86,8 +85,7 @@ class Recipe:
 
     def __post_init__(self) -> None:
         """Refuses seeds that not every generator takes."""
-        if not 0 <= self.seed <= MOST_SEED:
-            raise ValueError(f"seed={self.seed} should be 0 to {MOST_SEED}")
+        require_within(self, seed=(0, MOST_SEED))
 
 
 def choose_device(name: str) -> torch.device:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from twofold.config import require_within
 from twofold.geometry.cameras import Rays
 from twofold.geometry.samples import Samples
 from twofold.volume.rendering import laplace_density
@@ -124,11 +125,9 @@ class ErrorBoundedSampler:
 
     def __post_init__(self) -> None:
         """Refuses numbers that leave nothing to do."""
-        if min(self.refined, self.shaded) < 2 or self.rounds < 1 or self.tolerance <= 0:
-            raise ValueError(
-                f"refined={self.refined} and shaded={self.shaded} should be at least 2, rounds={self.rounds} at least "
-                f"1 and tolerance={self.tolerance} positive"
-            )
+        require_within(
+            self, refined=(2, 4096), shaded=(2, 4096), rounds=(1, 100), bisections=(1, 100), tolerance=(1e-6, 1e3)
+        )
         if not 0 <= self.extra <= self.refined:
             raise ValueError(f"extra={self.extra} depths cannot be chosen from refined={self.refined}")
 
