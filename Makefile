@@ -45,7 +45,7 @@ format: $(VENV)/.ready-all ## Repair what ruff can repair
 benchmarks: $(VENV)/.ready-studio ## Measure speed, beside the reference form, on one thread and on all (an hour)
 	for threads in 1 $$(getconf _NPROCESSORS_ONLN); do \
 		for part in step rendering quality; do \
-			$(BIN)/python benchmarks/$$part.py --threads $$threads || exit; \
+			$(BIN)/python -m benchmarks.$$part --threads $$threads || exit; \
 		done; \
 	done
 

@@ -180,6 +180,15 @@ def test_a_run_is_trained_drawn_and_measured_and_each_command_says_where_and_wha
     assert "already holds a run" in refused(capsys, "train", person_folder, "--out", run)
 
 
+@pytest.mark.parametrize("size", [15, 100_000, -1])
+def test_pictures_of_no_size_and_of_more_than_memory_holds_are_refused(
+    size: int, trained: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = refused(capsys, "render", trained.folder, "--out", tmp_path / "out", "--size", size)
+    assert said == f"twofold: --size should be 16 to 4096; it is {size}."
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("command", ["render", "evaluate", "train"])
 def test_a_run_is_not_drawn_measured_or_continued_with_somebody_else(
     command: str, trained: Run, person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from twofold.cli_captures import check, import_capture, prepare, studio
-from twofold.console import ALONE, at_least, bar, console, say
+from twofold.console import ALONE, bar, console, say, within
 from twofold.errors import TwofoldError
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def render(
     Args:
         run: Run folder.
         what: Everything, or one part.
-        size: Rows of the pictures of the orbit and of the canonical pose.
+        size: Rows of the pictures of the orbit and of the canonical pose, 16 to 4096.
         capture: Capture folder, if it has moved since training.
         out: Folder for the pictures; by default RUN/renders.
         chunk: Rays at once; by default as many as the free memory holds.
@@ -149,7 +149,7 @@ def render(
     from twofold.outputs.gallery import render_run
     from twofold.train.run import choose_device, find_capture, load, require_same
 
-    at_least(size=(size, 8), chunk=(chunk, 1))
+    within(size=(size, 16, 4096), chunk=(chunk, 1, None))
     avatar, _ = load(run, choose_device(device))
     read = read_capture(find_capture(run, capture))
     require_same(run, read, motion=False)
@@ -179,7 +179,7 @@ def evaluate(
     from twofold.evaluate import evaluate as measure
     from twofold.train.run import choose_device, find_capture, load, require_same
 
-    at_least(most=(most, 1), meshes=(meshes, 0))
+    within(most=(most, 1, None), meshes=(meshes, 0, None))
     avatar, _ = load(run, choose_device(device))
     read = read_capture(find_capture(run, capture))
     require_same(run, read, motion=True)

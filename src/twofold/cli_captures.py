@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from twofold.console import at_least, bar, console, say
+from twofold.console import bar, console, say, within
 
 
 def studio(
@@ -130,7 +130,7 @@ def check(
     from twofold.prepare.check.page import write_check
     from twofold.prepare.check.rules import judge
 
-    at_least(most=(most, 2))
+    within(most=(most, 2, None))
     with bar("Checking") as show:
         facts, read = measure_capture(capture, most, lambda done: show(0.9 * done, ""))
         judgement = judge(facts)

@@ -56,8 +56,13 @@ def say(result: str, following: str) -> None:
     console().print(f"{result} Next: {following}", soft_wrap=True)
 
 
-def at_least(**options: tuple[int | None, int]) -> None:
-    """Refuses options (value, least) that are too small."""
-    for name, (value, least) in options.items():
-        if value is not None and value < least:
-            raise TwofoldError(f"--{name} should be at least {least}; it is {value}.")
+def within(**options: tuple[int | None, int, int | None]) -> None:
+    """Refuses options (value, least, most or None for no limit) that are too small or too large.
+
+    Raises:
+        TwofoldError: names the first one and its limits.
+    """
+    for name, (value, least, most) in options.items():
+        if value is not None and (value < least or (most is not None and value > most)):
+            limits = f"at least {least}" if most is None else f"{least} to {most}"
+            raise TwofoldError(f"--{name} should be {limits}; it is {value}.")

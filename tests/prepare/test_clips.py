@@ -136,7 +136,7 @@ def test_a_video_is_called_without_its_ending(tmp_path):
         ((), {}, "none was given"),
         (("a", "b"), {}, "2 videos were given, which need --calibration"),
         (("a",), {"intrinsics": (0.0, 1.0, 1.0, 1.0)}, "fx and fy above 0"),
-        (("a",), {"intrinsics": (9.0, 9.0, 1.0, 1.0), "calibration": "c.json"}, "go without --calibration"),
+        (("a",), {"intrinsics": (9.0, 9.0, 1.0, 1.0), "calibration": "c.json"}, "were both given"),
         (("a",), {"held_out": 2}, "One moment of 2 cannot be held out"),
     ],
 )
@@ -158,6 +158,23 @@ def test_intrinsics_are_four_numbers(text):
     with pytest.raises(TwofoldError, match="--intrinsics should be four numbers"):
         read_intrinsics(text)
     assert read_intrinsics(None) is None
+
+
+@pytest.mark.parametrize("text", ["nan,500,10,10", "500,500,inf,10", "0,500,10,10", "500,-1,10,10"])
+def test_intrinsics_are_finite_with_a_focal_length_above_zero(tmp_path, text):
+    with pytest.raises(TwofoldError, match=f"fx and fy above 0; they are {text}"):
+        read_intrinsics(text)
+    numbers = tuple(float(number) for number in text.split(","))
+    with pytest.raises(TwofoldError, match=f"fx and fy above 0; they are {text}"):
+        require_options([tmp_path / "a"], replace(PLAIN, intrinsics=numbers))
+
+
+def test_intrinsics_of_another_unit_are_refused_before_any_work(tmp_path):
+    with pytest.raises(TwofoldError, match=r"--intrinsics 1.2,1.2,0.5,0.5 do not go with the video: the focal length"):
+        open_clips([a_clip(tmp_path, "left")], replace(PLAIN, intrinsics=(1.2, 1.2, 0.5, 0.5)))
+
+
+def test_good_intrinsics_are_taken():
     assert read_intrinsics("1050, 1051.5,540,9.6e2") == (1050, 1051.5, 540, 960)
 
 

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from twofold.capture.contents import intrinsics_faults
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
 from twofold.prepare.calibration import CalibratedCamera, for_pictures, largest_distortion, match_cameras, pinhole
@@ -91,7 +92,16 @@ def read_intrinsics(text: str | None) -> tuple[float, float, float, float] | Non
         raise TwofoldError(
             f"--intrinsics should be four numbers fx,fy,cx,cy in pixels, such as 1050,1050,540,960; it is {text!r}."
         ) from None
+    _require_lens((fx, fy, cx, cy))
     return fx, fy, cx, cy
+
+
+def _require_lens(lens: tuple[float, float, float, float]) -> None:
+    if not (np.isfinite(lens).all() and min(lens[:2]) > 0):
+        given = ",".join(f"{number:g}" for number in lens)
+        raise TwofoldError(
+            f"--intrinsics should be finite numbers fx,fy,cx,cy in pixels with fx and fy above 0; they are {given}."
+        )
 
 
 def require_options(clips: Sequence[Path], config: PrepareConfig) -> None:
@@ -107,8 +117,12 @@ def require_options(clips: Sequence[Path], config: PrepareConfig) -> None:
             f"{len(clips)} videos were given, which need --calibration FILE to say where their cameras stand; "
             "give one, or prepare a single video."
         )
-    if config.intrinsics is not None and (config.calibration is not None or min(config.intrinsics[:2]) <= 0):
-        raise TwofoldError("--intrinsics are fx,fy,cx,cy in pixels, fx and fy above 0, and go without --calibration.")
+    if config.intrinsics is not None:
+        _require_lens(config.intrinsics)
+        if config.calibration is not None:
+            raise TwofoldError(
+                "--intrinsics and --calibration were both given; the calibration has them, take it alone."
+            )
     if config.held_out < 3:
         raise TwofoldError(
             f"One moment of {config.held_out} cannot be held out between two that train; take 3 or more."
@@ -152,13 +166,20 @@ def _folder_name(name: str) -> str:
 
 
 def _guessed(info: ClipInfo, config: PrepareConfig) -> Camera:
-    """A camera at the world's origin."""
+    """A camera at the world's origin.
+
+    Raises:
+        TwofoldError: the lens that was given belongs to no picture of this size.
+    """
     across, down = info.width / info.full_width, info.height / info.full_height
     if config.intrinsics is None:
         fx = fy = FOCAL_GUESS * max(info.width, info.height)
         cx, cy = (info.width - 1) / 2, (info.height - 1) / 2
     else:
         fx, fy, cx, cy = config.intrinsics
+        faults = intrinsics_faults(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), info.full_width)
+        if faults:
+            raise TwofoldError(f"--intrinsics {fx:g},{fy:g},{cx:g},{cy:g} do not go with the video: {faults[0]}")
         fx, fy, cx, cy = fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
     return Camera(torch.eye(4), torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), info.height, info.width)
 
