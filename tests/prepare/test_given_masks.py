@@ -43,6 +43,15 @@ def test_masks_find_their_pictures(tmp_path, names):
     assert masks(10) is None
 
 
+def test_masks_without_anybody_are_named_at_once(tmp_path):
+    for number in range(10):
+        Image.new("L", (64, 48), 100).save(tmp_path / f"{number}.png")
+    with pytest.raises(TwofoldError, match=r"All masks in .* are black, so nobody is in them"):
+        masks_from_folder(tmp_path, CLIP)
+    Image.new("L", (64, 48), 255).save(tmp_path / "9.png")
+    assert rows(masks_from_folder(tmp_path, CLIP)(9)) == 48
+
+
 @pytest.mark.parametrize("first", [0, 1, 3])
 def test_numbers_may_have_gaps(tmp_path, first):
     numbers = [0, 1, 2, 4, 6, 9] if first < 2 else [0, 1, 2, 3, 4, 5]

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from acting import HEIGHT
+from PIL import Image
 from staged import PLAIN, Stage, names
 
 from twofold.capture.contents import read_contents
@@ -59,6 +60,56 @@ def test_clips_that_cannot_work_are_refused_and_leave_nothing(tmp_path, monkeypa
     assert "\n" not in str(error.value)
     assert names(tmp_path) == ["clips"]
     assert all(finder.closed for finder in stage.finders)
+
+
+def masks_of_nobody_there(stage, folder):
+    folder.mkdir()
+    for time in range(14):
+        Image.fromarray(np.roll(stage.evidence["cam0"].masks[time], 60, 1)).save(folder / f"{time:03d}.png")
+    return {"masks": folder}
+
+
+def poses_at_the_origin(stage, folder):
+    folder.mkdir()
+    np.savez(folder / "poses.npz", poses=np.zeros((14, 24, 3)), translations=np.zeros((14, 3)))
+    return {"poses": folder / "poses.npz"}
+
+
+def landmarks_anywhere(stage, folder):
+    folder.mkdir()
+    values = np.random.default_rng(0).uniform(20, HEIGHT - 20, (14, 33, 3))
+    values[..., 2] = 1
+    np.savez(folder / "landmarks.npz", landmarks=values)
+    return {"landmarks": folder / "landmarks.npz"}
+
+
+def landmarks_of_nobody(stage, folder):
+    given = landmarks_anywhere(stage, folder)
+    np.savez(given["landmarks"], landmarks=np.zeros((14, 33, 3)))
+    return given
+
+
+@pytest.mark.parametrize("spoil", [masks_of_nobody_there, poses_at_the_origin, landmarks_anywhere, landmarks_of_nobody])
+def test_what_the_user_gave_is_blamed_before_the_film(tmp_path, monkeypatch, spoil):
+    stage = Stage(tmp_path / "clips", 14)
+    stage.is_understood(monkeypatch)
+    given = spoil(stage, tmp_path / "own")
+    ((piece, path),) = given.items()
+    with pytest.raises(TwofoldError) as error:
+        stage.prepare(tmp_path / "me", replace(PLAIN, **given))
+    assert f"the likeliest cause is --{piece} {path} (" in str(error.value)
+    assert "film" not in str(error.value)
+    assert names(tmp_path) == ["clips", "own"]
+
+
+def test_a_calibration_whose_names_go_with_other_cameras_is_blamed(tmp_path, monkeypatch):
+    stage = Stage(tmp_path / "clips", 14, azimuths=(0.4, 1.9))
+    stage.is_understood(monkeypatch)
+    first, second = stage.cameras.values()
+    stage.cameras = {"cam0": second, "cam1": first}
+    with pytest.raises(TwofoldError, match=r"the likeliest cause is --calibration .*cameras\.json \(do its cameras'"):
+        stage.prepare(tmp_path / "me")
+    assert names(tmp_path) == ["clips"]
 
 
 @pytest.mark.parametrize("refuse", ["refuse", "ignore"])

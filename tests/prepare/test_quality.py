@@ -155,7 +155,7 @@ def test_more_than_three_in_ten_bad_moments_are_too_many(bad):
         kept_times(records(faults), "clip")
     span = f"{20 - bad}-19"
     assert f"{bad} of 20 pictures of clip could not be understood (moments {span})" in str(error.value)
-    assert f"at {20 - bad}, for one, reason {20 - bad}." in str(error.value)
+    assert f"at {20 - bad}, for one, reason {20 - bad}; film one person" in str(error.value)
 
 
 def facing(angles, tilt=(0.0, 0.0, 0.0), camera=CAMERA):

@@ -55,6 +55,29 @@ class PrepareConfig:
     several_people: Literal["refuse", "ignore"] = "refuse"
 
 
+_HINTS = {
+    "masks": "is each white on the person of its own picture?",
+    "landmarks": "are they of this clip, in pixels of its full size?",
+    "poses": "are they of this clip and body, in metres and radians, before the camera?",
+    "calibration": "do its cameras' names go with the videos', and is it of this recording?",
+}
+"""What to ask about each piece of the user's own."""
+
+
+def advice(config: PrepareConfig, film: str, pieces: Sequence[str] = tuple(_HINTS)) -> str:
+    """What to do about pictures that are not understood, the end of a sentence.
+
+    Args:
+        config: what was given.
+        film: what to do where nothing was given that could be at fault: then it is the film.
+        pieces: which of the user's own pieces could be at fault.
+    """
+    given = [(piece, getattr(config, piece)) for piece in pieces if getattr(config, piece) is not None]
+    if not given:
+        return film
+    return "the likeliest cause is " + ", or ".join(f"--{piece} {path} ({_HINTS[piece]})" for piece, path in given)
+
+
 @dataclass(frozen=True)
 class Clip:
     """One clip, ready to be looked at.

@@ -10,6 +10,9 @@ from PIL import Image
 from twofold.errors import TwofoldError
 from twofold.prepare.frames import ClipInfo, files_by_picture, picture_files, picture_size
 
+_OUTSIDE = 127
+"""Up to here a mask's pixel is no person."""
+
 
 @dataclass(frozen=True)
 class GivenMasks:
@@ -48,7 +51,8 @@ def masks_from_folder(folder: Path | str, info: ClipInfo) -> GivenMasks:
         info: the clip.
 
     Raises:
-        TwofoldError: there are none, of another size, of another clip, or for less than half of the clip.
+        TwofoldError: there are none, of another size, of another clip, or for less than half of the clip; or nobody is
+            in any of them.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -67,6 +71,8 @@ def masks_from_folder(folder: Path | str, info: ClipInfo) -> GivenMasks:
         raise TwofoldError(
             f"{folder} holds {len(files)} masks, and the clip has {info.sources} pictures; at least half need one."
         )
+    if all(read_mask(path).max() <= _OUTSIDE for path in files.values()):  # the first that shows somebody ends it
+        raise TwofoldError(f"All masks in {folder} are black, so nobody is in them; make them white on the person.")
     return GivenMasks(files, info.width, info.height)
 
 

@@ -20,7 +20,7 @@ from twofold.files import plain_errors
 from twofold.geometry.cameras import Camera
 from twofold.prepare.agreement import Agreement, compare_with_pictures
 from twofold.prepare.calibration import pinhole, undistort, undistorter
-from twofold.prepare.clips import Clip, PrepareConfig, longer, open_clips, require_options
+from twofold.prepare.clips import Clip, PrepareConfig, advice, longer, open_clips, require_options
 from twofold.prepare.evidence import Evidence
 from twofold.prepare.fit import fit
 from twofold.prepare.given_landmarks import landmarks_from_file, track_at
@@ -30,6 +30,9 @@ from twofold.prepare.motion import Motion, choose, pose_motion
 from twofold.prepare.observations import Estimator, Track
 from twofold.prepare.people import People
 from twofold.prepare.quality import (
+    FARTHER,
+    LARGER,
+    STEADIER,
     PictureQuality,
     kept_times,
     require_length,
@@ -243,7 +246,7 @@ def _own_landmarks(clip: Clip, seen: Watched, config: PrepareConfig, clips: int)
         return None
     track = landmarks_from_file(_piece(config.landmarks, clip, clips), clip.info)
     track = track_at(track, seen.sources)
-    require_person(track, str(config.landmarks))
+    require_person(track, str(config.landmarks), advice(config, LARGER, ("landmarks",)))
     pixels = track.pixels
     if clip.lens is not None:
         pixels = undistort(clip.lens, pixels.astype(np.float64)).astype(np.float32)
@@ -259,7 +262,7 @@ def _judge_all(found: _Found, body: Body, config: PrepareConfig, show: Show) -> 
             name, camera, found.watched[k], body, found.motion, standing, config.held_objects, count == 1,
             lambda done, k=k: show(0.7 + 0.28 * (k + done) / count, "judging the fit"),
         )  # fmt: skip
-        require_whole(agreement.qualities, name)
+        require_whole(agreement.qualities, name, advice(config, FARTHER, ("landmarks",)))
         agreed.append(agreement)
     return agreed
 
@@ -282,7 +285,7 @@ def _write(
 ) -> Prepared:
     watched = found.watched
     qualities = [quality for agreement in agreed for quality in agreement.qualities]
-    kept = kept_times(qualities, ", ".join(found.cameras))
+    kept = kept_times(qualities, ", ".join(found.cameras), advice(config, STEADIER))
     poses, translations, cameras = _upright(found, body)
     train = _training_camera(list(cameras), config.train_camera)
     held_out = [time for number, time in enumerate(kept) if number % config.held_out == config.held_out // 2]

@@ -27,6 +27,11 @@ LEAST_PICTURES = 12
 FULL_TURN = 180.0
 """A body that turns through less, in degrees, has a side that no picture shows."""
 
+LARGER = "film one whole person, well lit and large enough, and try again"
+FARTHER = "film from farther away, so that the whole body stays in view"
+STEADIER = "film one person who stays in full view, without quick turns"
+"""What to do about a film that is itself at fault."""
+
 _ENDS = ("nose", "left_ankle", "right_ankle", "left_wrist", "right_wrist")
 
 
@@ -123,12 +128,13 @@ def require_length(pictures: int, clip: str) -> None:
         )
 
 
-def require_person(track: Track, clip: str) -> None:
+def require_person(track: Track, clip: str, advice: str = LARGER) -> None:
     """Refuses clips in which a person is seldom found.
 
     Args:
         track: as found.
         clip: for the message.
+        advice: what to do, to end it.
 
     Raises:
         TwofoldError: as said.
@@ -136,11 +142,16 @@ def require_person(track: Track, clip: str) -> None:
     share = float(track.found.mean())
     if share < 1 - MOST_BAD:
         found = "nobody" if share == 0 else f"a person in only {100 * share:.0f} % of the pictures"
-        raise TwofoldError(f"{clip} shows {found}; film one whole person, well lit and large enough, and try again.")
+        raise TwofoldError(f"{clip} shows {found}; {advice}.")
 
 
-def require_whole(qualities: Sequence[PictureQuality], clip: str) -> None:
+def require_whole(qualities: Sequence[PictureQuality], clip: str, advice: str = FARTHER) -> None:
     """Refuses clips in which the person is cut off by the picture's edge most of the time.
+
+    Args:
+        qualities: of the clip's pictures.
+        clip: for the message.
+        advice: what to do, to end it.
 
     Raises:
         TwofoldError: in more than half of the pictures.
@@ -149,12 +160,17 @@ def require_whole(qualities: Sequence[PictureQuality], clip: str) -> None:
     if share > 0.5:
         raise TwofoldError(
             f"In {100 * share:.0f} % of the pictures of {clip} head, hands or feet are beyond the picture's edge; "
-            "film from farther away, so that the whole body stays in view."
+            f"{advice}."
         )
 
 
-def kept_times(qualities: Sequence[PictureQuality], clip: str) -> list[int]:
+def kept_times(qualities: Sequence[PictureQuality], clip: str, advice: str = STEADIER) -> list[int]:
     """Moments at which no camera's picture is bad.
+
+    Args:
+        qualities: of all pictures.
+        clip: for the message.
+        advice: what to do, to end it.
 
     Raises:
         TwofoldError: too many are bad, with the commonest reasons.
@@ -168,7 +184,7 @@ def kept_times(qualities: Sequence[PictureQuality], clip: str) -> list[int]:
         example = min(faults)
         raise TwofoldError(
             f"{len(faults)} of {len(times)} pictures of {clip} could not be understood (moments {spans(faults)}); at "
-            f"{example}, for one, {faults[example]}. Film one person who stays in full view, without quick turns."
+            f"{example}, for one, {faults[example]}; {advice}."
         )
     return [time for time in times if time not in faults]
 
