@@ -37,7 +37,7 @@ def train(
     """Trains an avatar from a capture folder.
 
     Args:
-        capture: Capture folder (`twofold studio`, `twofold import`).
+        capture: Capture folder (`twofold prepare`, `twofold studio`, `twofold import`).
         out: Run folder to make; by default runs/NAME-RECIPE.
         recipe: quick (minutes on a CPU), fast (the released networks, sampled near the body), released, paper.
         set: Settings, such as training.steps=500; one or several, once or several times.
@@ -83,7 +83,8 @@ def train(
         where_asked = ["--device", device] if device != "auto" else []
         words = ["twofold", "train", *moved, "--resume", str(folder), *where_asked]
         raise KeyboardInterrupt(f"The training continues with: {shlex.join(words)}") from None
-    say(f"The avatar is in {folder}.", f"twofold render {folder}")
+    moved = capture if resume else None
+    say(f"The avatar is in {folder}.", _with_capture(["twofold", "render", str(folder)], moved))
 
 
 def _show_settings(recipe: Recipes, overrides: tuple[str, ...], seed: int) -> None:
@@ -156,7 +157,7 @@ def render(
     folder = out or run / "renders"
     with bar("Drawing") as show:
         render_run(avatar, read, folder, what, size, chunk, lambda done: show(done, ""))
-    say(f"The pictures are in {folder}.", f"twofold evaluate {run}")
+    say(f"The pictures are in {folder}.", _with_capture(["twofold", "evaluate", str(run)], capture))
 
 
 def evaluate(
@@ -198,7 +199,12 @@ def evaluate(
             numbers = {k: v for k, v in values.items() if isinstance(v, float)}
             line = f"{section}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items())
             console().print(line, soft_wrap=True)
-    say(f"The figures are in {run / 'metrics.json'}.", f"twofold render {run}")
+    say(f"The figures are in {run / 'metrics.json'}.", _with_capture(["twofold", "render", str(run)], capture))
+
+
+def _with_capture(words: list[str], capture: Path | None) -> str:
+    """A command about a run, which has to be told of a capture that has moved as the one before it was."""
+    return shlex.join([*words, *(["--capture", str(capture)] if capture else [])])
 
 
 def demo(out: Path = Path("demo"), seed: int = 0) -> None:

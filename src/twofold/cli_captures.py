@@ -127,10 +127,11 @@ def check(
         most: At most so many pictures are looked at, spread evenly.
     """
     from twofold.prepare.check.facts import measure_capture
-    from twofold.prepare.check.page import write_check
+    from twofold.prepare.check.page import require_no_file, write_check
     from twofold.prepare.check.rules import judge
 
     within(most=(most, 2, None))
+    require_no_file(out or capture / "check")
     with bar("Checking") as show:
         facts, read = measure_capture(capture, most, lambda done: show(0.9 * done, ""))
         judgement = judge(facts)

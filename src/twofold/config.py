@@ -211,7 +211,8 @@ def _replaced(config: object, key: str, text: str, whole: object, parents: str =
     if name not in {f.name for f in _fields(config)}:
         keys = [k for k, _, _ in _leaves(whole)]
         hint = _suggestion(parents + key, keys)
-        raise TwofoldError(f"There is no setting {parents + key!r}; known are {', '.join(keys)}.{hint}")
+        known = hint or f" Known are {', '.join(keys)}."
+        raise TwofoldError(f"There is no setting {parents + key!r}.{known}")
     annotation, value = get_type_hints(type(config))[name], getattr(config, name)
     if dot and not _is_config(value):
         classes = [c.__name__ for c in _choices(annotation) if isinstance(c, type) and dataclasses.is_dataclass(c)]

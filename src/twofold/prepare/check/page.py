@@ -39,6 +39,17 @@ MARKS = {"fault": "✗", "warning": "!", "note": "i"}
 WORDS = {"good": "Good", "usable": "Usable", "waste": "Waste of time"}
 
 
+def require_no_file(folder: Path) -> None:
+    """Says no to a place for the page that is a file or lies below one, before any work is done for it.
+
+    Raises:
+        TwofoldError: names the file.
+    """
+    for place in (folder, *folder.parents):
+        if place.exists() and not place.is_dir():
+            raise TwofoldError(f"{place} is a file, expected a folder for the page; choose another --out.")
+
+
 def write_check(facts: Facts, capture: Capture, judgement: Judgement, folder: Path | str) -> Path:
     """Writes page and numbers into a folder, which is made where it is missing; returns the page's path.
 
@@ -46,9 +57,8 @@ def write_check(facts: Facts, capture: Capture, judgement: Judgement, folder: Pa
         TwofoldError: the folder cannot be written.
     """
     folder = Path(folder)
+    require_no_file(folder)
     with plain_errors(folder):
-        if folder.exists() and not folder.is_dir():
-            raise TwofoldError(f"{folder} is a file, expected a folder for the page; choose another --out.")
         folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / NUMBERS, numbers(facts, judgement))
     write_bytes(folder / PAGE, document(f"Check of {facts.name}", _body(facts, capture, judgement), STYLE))
