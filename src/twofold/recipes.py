@@ -83,7 +83,7 @@ def quick() -> Recipe:
             shell_refresh=400,
         ),
         training=TrainingConfig(
-            steps=1500,
+            steps=4000,
             images_per_step=1,
             pixels=PixelConfig(rays=1024, subject_share=0.95, surroundings=6, patches=0),
             rate_low=2e-3,
