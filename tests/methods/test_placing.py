@@ -6,10 +6,12 @@ import pytest
 import torch
 from small_recipes import CASES
 
+from twofold.deform.shell import build_shell
+from twofold.deform.skinning import to_canonical
 from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods import factorized
 from twofold.methods.base import Subject
-from twofold.methods.placing import ShellSampler
+from twofold.methods.placing import ShellSampler, place_in_shell, without_strays
 from twofold.train.loop import train
 
 BLACK = torch.zeros(3)
@@ -85,6 +87,31 @@ def test_training_asks_about_every_sample(dense, person, looking):
     dense.render(rays, posed, BLACK, torch.Generator().manual_seed(0))
     assert dense._last_table is None
     dense.eval()
+
+
+def test_samples_that_are_carried_to_another_part_are_air(dense, person):
+    """The rest are as far from the canonical body as they were from the posed one."""
+    frame = person.train[1]
+    with torch.no_grad():
+        posed = dense.pose(frame.pose, frame.translation)
+    rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
+    sampler = dense.config.sampler
+    placed = place_in_shell(sampler, rays, posed, 1, sampler.radius, None)
+    home = build_shell(dense.canonical_points, posed.body.faces, sampler.radius, sampler.voxel)
+    kept = without_strays(placed, rays, posed, home, 0.006)
+
+    def nearer(some):
+        points = some.samples.points(rays)
+        x, _ = to_canonical(points, some.nearest, some.shares, posed.forward)
+        away = (points - posed.body.vertices[some.nearest[:, 0]]).norm(dim=-1)
+        return away - torch.cdist(x, dense.canonical_points).amin(1)
+
+    assert 0 < len(kept.samples) < len(placed.samples)
+    assert (nearer(placed) > 0.02).any()
+    # What a voxel does not list may still be nearer, hence not all.
+    assert (nearer(kept) < 0.0061).float().mean() > 0.99
+    everything = without_strays(placed, rays, posed, home, 1.0)
+    assert len(everything.samples) == len(placed.samples)
 
 
 @pytest.mark.parametrize("wrong", [{"radius": 0.0}, {"step": -1.0}, {"table_voxel": -0.1}, {"table_voxel": 1e-3}])

@@ -32,6 +32,7 @@ from twofold.methods.placing import (
     only_seen,
     place_error_bounded,
     place_in_shell,
+    without_strays,
 )
 from twofold.metrics.perceptual import LPIPS
 from twofold.speed import compiled_methods
@@ -170,6 +171,7 @@ class FactorizedAvatar(Avatar):
         self._shells: dict[int, Shell] = {}
         self._bodies = {torch.device("cpu"): subject.body}
         self._perceptual: tuple[LPIPS, ...] = ()
+        self._home: Shell | None = None
         self._last_table: tuple[PosedAvatar, tuple[int, ...], DistanceTable] | None = None
 
     def attach_lpips(self, network: LPIPS | None) -> None:
@@ -310,10 +312,18 @@ class FactorizedAvatar(Avatar):
             shading = self.config.outliers_in_shading and generator is None
             return replace(placed, outlier=placed.outlier & shading)
         placed = place_in_shell(sampler, rays, posed, k, min(sampler.radius, limit), generator)
+        if not self.training and generator is None and len(placed.samples):
+            placed = without_strays(placed, rays, posed, self._canonical_shell(sampler, posed), _STRAY)
         if sampler.least_weight == 0 or len(placed.samples) == 0:
             return placed
         table = None if self.training or generator is not None else self._table(len(placed.samples), posed, distance)
         return only_seen(placed, rays, posed, distance, self.beta, sampler.least_weight, table)
+
+    def _canonical_shell(self, sampler: ShellSampler, posed: PosedAvatar) -> Shell:
+        if self._home is None or self._home.vertices.device != self.device:
+            points, faces = self.canonical_points, posed.body.faces
+            self._home = build_shell(points, faces, sampler.radius, sampler.voxel)
+        return self._home
 
     def _table(self, samples: int, posed: PosedAvatar, distance: Distance) -> DistanceTable | None:
         """The distance table of this pose, made as soon as it pays; the last one is kept."""
@@ -376,6 +386,8 @@ def _require(holds: bool, wanted: str) -> None:
 
 _TABLE_PAYS = 150_000
 """Samples from which on a distance table at 15 mm, of some eighty thousand nodes, is the quicker way."""
+_STRAY = 0.006
+"""Metres by which a picture's sample may come closer to the body when it is carried home; skin stretches a little."""
 _BETA_UNIT = 0.01
 """Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from twofold.config import require_within
-from twofold.deform.shell import nearest_listed, sample_shell
+from twofold.deform.shell import Shell, nearest_listed, sample_shell
 from twofold.deform.skinning import neighbour_weights, to_canonical
 from twofold.field.distance_table import DistanceTable
 from twofold.geometry.cameras import Rays, clip_to_box
@@ -80,6 +80,26 @@ def place_in_shell(
         nearest, squared = nearest_listed(posed.shell, points, posed.shell.rows_at(points), neighbours)
     outlier = torch.zeros(len(samples), dtype=torch.bool, device=squared.device)
     return Placed(samples, nearest, neighbour_weights(squared), outlier)
+
+
+@torch.no_grad()
+def without_strays(placed: Placed, rays: Rays, posed: PosedAvatar, canonical: Shell, slack: float) -> Placed:
+    """Without samples that inverse skinning carries to a part of the body that they are not at.
+
+    Air beside the neck belongs to the shoulder below it. Carried home by a lowered arm it ends up inside the head. So a
+    sample that comes closer to the canonical body than it was to the posed one, by more than `slack` metres, is air.
+    """
+    points = placed.samples.points(rays)
+    away = (points - posed.body.vertices[placed.nearest[:, 0]]).norm(dim=-1)
+    far = (away > slack).nonzero()[:, 0]
+    part = placed[far]
+    x_canonical, _ = to_canonical(points[far], part.nearest, part.shares, posed.forward)
+    rows = canonical.rows_at(x_canonical)
+    near = (rows >= 0).nonzero()[:, 0]
+    _, squared = nearest_listed(canonical, x_canonical[near], rows[near], 1)
+    stray = torch.zeros(len(placed.samples), dtype=torch.bool, device=away.device)
+    stray[far[near]] = squared[:, 0].sqrt() < away[far[near]] - slack
+    return placed[(~stray).nonzero()[:, 0]]
 
 
 @torch.no_grad()
