@@ -73,7 +73,7 @@ def quick() -> Recipe:
         name="quick",
         method=FactorizedConfig(
             field=GridFieldConfig(),
-            sampler=ShellSampler(radius=0.06, step=0.01, least_weight=2e-3),
+            sampler=ShellSampler(radius=0.06, step=0.01, least_weight=2e-3, stray=0.006),
             losses=LossConfig(
                 eikonal=0.05, mask=0.3, mask_form="mean", s3im=0.0, lpips=0.0, common=0.5, eikonal_points=512
             ),

@@ -312,8 +312,8 @@ class FactorizedAvatar(Avatar):
             shading = self.config.outliers_in_shading and generator is None
             return replace(placed, outlier=placed.outlier & shading)
         placed = place_in_shell(sampler, rays, posed, k, min(sampler.radius, limit), generator)
-        if not self.training and generator is None and len(placed.samples):
-            placed = without_strays(placed, rays, posed, self._canonical_shell(sampler, posed), _STRAY)
+        if sampler.stray > 0 and not self.training and generator is None and len(placed.samples):
+            placed = without_strays(placed, rays, posed, self._canonical_shell(sampler, posed), sampler.stray)
         if sampler.least_weight == 0 or len(placed.samples) == 0:
             return placed
         table = None if self.training or generator is not None else self._table(len(placed.samples), posed, distance)
@@ -386,8 +386,6 @@ def _require(holds: bool, wanted: str) -> None:
 
 _TABLE_PAYS = 150_000
 """Samples from which on a distance table at 15 mm, of some eighty thousand nodes, is the quicker way."""
-_STRAY = 0.006
-"""Metres by which a picture's sample may come closer to the body when it is carried home; skin stretches a little."""
 _BETA_UNIT = 0.01
 """Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""
 

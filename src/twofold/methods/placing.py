@@ -35,6 +35,9 @@ class ShellSampler:
     """Edge of the voxels that list where the shell is, metres."""
     least_weight: float = 1e-3
     """Samples that a pass without gradients finds to add less than this to their pixel are left out; 0 keeps all."""
+    stray: float = 0.0
+    """Pictures: samples that come closer to the body by more than this when they are carried home, metres, are air; 0
+    keeps them. Not for a field that is no person yet."""
     table_voxel: float = 0.015
     """Pictures from dense networks: spacing of a lattice of distances, asked once a pose, that tells most samples to be
     empty or hidden before the networks are asked; metres, 0 asks the networks about every sample."""
