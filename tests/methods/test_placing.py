@@ -114,9 +114,11 @@ def test_samples_that_are_carried_to_another_part_are_air(dense, person):
     assert len(everything.samples) == len(placed.samples)
 
 
-@pytest.mark.parametrize("wrong", [{"radius": 0.0}, {"step": -1.0}, {"table_voxel": -0.1}, {"table_voxel": 1e-3}])
+@pytest.mark.parametrize(
+    "wrong", [{"radius": 0.0}, {"step": -1.0}, {"table_voxel": -0.1}, {"stray": -0.01}, {"table_voxel": 1e-3}]
+)
 def test_sizes_that_leave_nothing_to_sample_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"(radius|step|table_voxel)=.* should be 0"):
+    with pytest.raises(ValueError, match=r"(radius|step|stray|table_voxel)=.* should be 0"):
         ShellSampler(**wrong)
 
 

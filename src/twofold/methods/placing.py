@@ -46,8 +46,9 @@ class ShellSampler:
         """Refuses sizes that leave nothing to sample."""
         # The voxels of a body fill half a gigabyte at the least edge; a ray crosses it in a thousand steps.
         require_within(
-            self, radius=(0.005, 0.5), step=(0.001, 0.5), voxel=(0.005, 0.5), least_weight=(0, 1), table_voxel=(0, 0.5)
-        )
+            self, radius=(0.005, 0.5), step=(0.001, 0.5), voxel=(0.005, 0.5), least_weight=(0, 1), stray=(0, 0.5),
+            table_voxel=(0, 0.5),
+        )  # fmt: skip
         if 0 < self.table_voxel < 0.004:
             raise ValueError(f"table_voxel={self.table_voxel:g} should be 0.004 to 0.5, or 0 for no table")
 
