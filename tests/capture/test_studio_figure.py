@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from twofold.body.skeleton import canonical_pose, pose_body, shape_body
-from twofold.capture.studio_anatomy import arm_reach, leg_reach, survey
+from twofold.capture.studio_anatomy import arm_reach, bearing, leg_reach, survey
 from twofold.capture.studio_clothes import HAIR, SHIRT, SHOES, SKIN, SOLES, TROUSERS, dress
 from twofold.capture.studio_figure import build_figure
 from twofold.capture.studio_folds import bending, displacement, lay_folds
@@ -113,6 +113,17 @@ def test_reach_counts_joints_along_the_limbs(figure):
     j, a = figure.anatomy.joints, figure.anatomy
     assert arm_reach(j[[16, 18, 20, 17, 19, 21]], a) == pytest.approx([0, 1, 2, 0, 1, 2], abs=0.05)
     assert leg_reach(j[[1, 4, 7]], a) == pytest.approx([0, 1, 2], abs=0.05)
+
+
+def test_bearings_round_alike_wherever_their_memory_lies():
+    # Results soon come to lie right behind their table, where NumPy alone rounds otherwise (with AVX-512).
+    table = np.random.default_rng(0).normal(size=(5002, 3)).astype(np.float32)
+    first, kept = bearing(table[:, 0].copy(), table[:, 2].copy()), []
+    for _ in range(100):
+        again = table.copy()
+        kept += [again, bearing(again[:, 0], again[:, 2])]
+        assert np.array_equal(kept[-1], first)
+    np.testing.assert_allclose(first, np.angle(table[:, 2] + 1j * table[:, 0]), atol=1e-6)
 
 
 def test_eyes_lie_in_the_head_left_on_the_left(shaped):

@@ -123,6 +123,15 @@ def smoothstep(low: float | np.floating, high: float | np.floating, x: np.ndarra
     return t * t * (3 - 2 * t)
 
 
+def bearing(sideways: Float[np.ndarray, "*n"], ahead: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Angle from straight ahead, radians: NumPy's arctan2, rounded alike at every call.
+
+    NumPy keeps to a slower loop, which rounds otherwise, where inputs and result may share memory. It finds that of a
+    column of a table as soon as the result happens to lie right behind the table; a copy of the column has no such end.
+    """
+    return np.arctan2(np.ascontiguousarray(sideways), np.ascontiguousarray(ahead))
+
+
 def arm_reach(points: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
     """How far along an arm: 0 shoulder, 1 elbow, 2 wrist."""
     j = anatomy.joints

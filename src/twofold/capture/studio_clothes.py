@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
-from twofold.capture.studio_anatomy import Anatomy, arm_reach, around_neck, leg_reach, smoothstep
+from twofold.capture.studio_anatomy import Anatomy, arm_reach, around_neck, bearing, leg_reach, smoothstep
 from twofold.capture.studio_look import Look
 from twofold.geometry.trees import search_tree
 
@@ -107,7 +107,7 @@ def _hair(points: np.ndarray, round_: np.ndarray, anatomy: Anatomy, look: Look) 
     near = points[:, 1] > eyes[1] - 4 * unit
     away = np.full(len(points), 1.0, np.float32)
     p = points[near] - np.array([0, eyes[1], 0.5 * (eyes[2] + head[2]) - 0.4 * unit], np.float32)
-    angle = np.arctan2(np.abs(p[:, 0]), p[:, 2])
+    angle = bearing(np.abs(p[:, 0]), p[:, 2])
     style = {"beanie": "beanie", "bob": "curtain", "bun": "back", "ponytail": "back"}.get(look.hair, "short")
     line = (PchipInterpolator(*_HAIRLINES[style])(angle) * unit).astype(np.float32)
     above = p[:, 1] - line

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from twofold.capture.studio_anatomy import smoothstep
+from twofold.capture.studio_anatomy import bearing, smoothstep
 from twofold.capture.studio_clothes import SHIRT, TROUSERS
 from twofold.capture.studio_figure import Figure
 
@@ -114,7 +114,7 @@ def lay_folds(figure: Figure, seed: int) -> tuple[Fold, ...]:
     add(belt * (0.2 + 0.9 * back), d[:, 1] - 0.15 * np.abs(p[:, 0]), 0.034, 13, 0.8)
     add(belt * (1 - left), d[:, 1] + 0.3 * p[:, 0], 0.032, 14)
     add(belt * left, d[:, 1] - 0.3 * p[:, 0], 0.032, 15)
-    around = 0.14 * np.arctan2(p[:, 0], p[:, 2] - j[0, 2]) * np.where(front > 0.5, 1, -1)
+    around = 0.14 * bearing(p[:, 0], p[:, 2] - j[0, 2]) * np.where(front > 0.5, 1, -1)
     wide = shirt * np.exp(-(((d[:, 1] - 0.1) / 0.16) ** 2)) * smoothstep(0.26, 0.2, np.abs(p[:, 0]))
     add(wide * np.abs(figure.normals[:, 2]), 0.75 * d[:, 1] + 0.66 * around, 0.036, 16)
     add(wide * np.abs(figure.normals[:, 2]), 0.75 * d[:, 1] - 0.66 * around, 0.036, 17)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from twofold.capture.studio_anatomy import Anatomy, arm_reach, smoothstep
+from twofold.capture.studio_anatomy import Anatomy, arm_reach, bearing, smoothstep
 from twofold.capture.studio_clothes import HAIR, SHIRT, SHOES, SKIN, SOLES, TROUSERS, collar
 from twofold.capture.studio_look import Color, Look
 
@@ -140,7 +140,7 @@ def _shirt(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
     x, y, z = p.T
     reach = arm_reach(p, a)
     sleeve = reach > 0.10
-    angle = np.where(sleeve, np.arctan2(z - j[16, 2], y - j[16, 1]), np.arctan2(x, z - j[3, 2]))
+    angle = np.where(sleeve, bearing(z - j[16, 2], y - j[16, 1]), bearing(x, z - j[3, 2]))
     along = np.where(sleeve, np.abs(x) - abs(j[16, 0]), y - a.crotch)
     color = np.repeat(first[None], len(p), 0)
     hem = y - (a.crotch + 0.035)
@@ -191,7 +191,7 @@ def _shirt(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
 
 def _emblem(x: np.ndarray, y: np.ndarray, which: int) -> np.ndarray:
     """Inside of a chest emblem about the origin, some 18 cm across: a star, a sun over waves, a bolt in a ring."""
-    r, angle = np.hypot(x, y), np.arctan2(x, y)
+    r, angle = np.hypot(x, y), bearing(x, y)
     if which == 0:
         fold = np.abs((angle / (2 * np.pi / 5) + 0.5) % 1 - 0.5) * (2 * np.pi / 5)
         return r * (np.cos(fold) + 1.15 * np.sin(fold)) < 0.085
@@ -286,7 +286,7 @@ def _hair(p: np.ndarray, a: Anatomy, look: Look) -> np.ndarray:
     middle = a.eyes.mean(0)
     head = a.joints[15]
     x, y, z = (p - [middle[0], middle[1], 0.5 * (middle[2] + head[2])]).astype(np.float32).T
-    angle = np.arctan2(x, z)
+    angle = bearing(x, z)
     if look.hair == "beanie":
         first, second = linear(look.second_color), linear(look.shirt_color)
         ribs = 0.8 + 0.2 * np.cos(angle * 44)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from scipy import ndimage
 
+from twofold.capture.studio_anatomy import bearing
 from twofold.geometry.cameras import Camera, pixel_grid, pixel_rays
 from twofold.geometry.raster import supersampled
 from twofold.geometry.rotations import rigid_transform
@@ -60,7 +61,7 @@ def room(camera: Camera, seed: int) -> Float[np.ndarray, "h w 3"]:
     tone = 0.75 + 0.18 * np.sin(boards * 12.9898) + 0.05 * np.sin(p[..., 2] * 35 + 4 * np.sin(boards * 3.1))
     tone = tone * np.where(np.abs(p[..., 0] / 0.16 - boards - 0.5) > 0.47, 0.6, 1)
     wood = tone[..., None] * np.array([0.56, 0.42, 0.30])
-    angle, y = np.arctan2(p[..., 0], p[..., 2]), p[..., 1]
+    angle, y = bearing(p[..., 0], p[..., 2]), p[..., 1]
     base = np.array([[0.55, 0.60, 0.58], [0.62, 0.56, 0.50], [0.50, 0.54, 0.64]])[random.integers(3)]
     paper = 0.92 + 0.08 * np.sign(np.sin(angle * 60)) * np.ones_like(y) - 0.08 * np.clip(y - 1.5, -1, 1)
     paint = paper[..., None] * base
