@@ -43,11 +43,7 @@ format: $(VENV)/.ready-all ## Repair what ruff can repair
 	$(BIN)/ruff format $(SOURCES)
 
 benchmarks: $(VENV)/.ready-studio ## Measure speed, beside the reference form, on one thread and on all (an hour)
-	for threads in 1 $$(getconf _NPROCESSORS_ONLN); do \
-		for part in step rendering quality; do \
-			$(BIN)/python -m benchmarks.$$part --threads $$threads || exit; \
-		done; \
-	done
+	$(BIN)/python -m benchmarks
 
 clean: ## Remove what the targets made, .venv included
 	rm -rf $(VENV) site dist build .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,16 +1,15 @@
 """Every benchmark with one thread and with all, one after the other; results go to benchmarks/results/."""
 
 import argparse
+import os
 import subprocess
 import sys
-
-import torch
 
 
 def main() -> None:
     """Runs them in processes of their own, so that each starts with fresh memory and threads."""
     argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__).parse_args()
-    for threads in sorted({1, torch.get_num_threads()}):
+    for threads in sorted({1, os.cpu_count() or 1}):
         for name in ("step", "rendering", "quality"):
             command = [sys.executable, "-m", f"benchmarks.{name}", "--threads", str(threads)]
             print("$", " ".join(command), flush=True)

@@ -1,11 +1,15 @@
 """Time to quality: PSNR over the subject's box on unseen views and poses against seconds of training.
 
+The reference form (paper-size networks, error-bounded sampler, autograd, float32) then trains for as many seconds. It
+takes minutes for a picture of ordinary size, so both are measured on small pictures of the same moments, too.
+
 python -m benchmarks.quality [--threads 2] [--steps 1000] [--seed 0] [--size 192]
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import tempfile
 import time
 from dataclasses import replace
@@ -14,11 +18,47 @@ from pathlib import Path
 import torch
 
 from benchmarks.common import store, studio_capture
+from benchmarks.step import reference
+from twofold.capture.types import Capture
 from twofold.demo import demo_recipe
 from twofold.evaluate import measure_split
 from twofold.methods.base import Avatar
 from twofold.speed import tune_process
 from twofold.train import loop
+
+SMALL = 48
+"""Rows and columns of the pictures that the reference form is asked for."""
+
+
+class OutOfTime(Exception):
+    """The reference form has trained for as long as it may."""
+
+
+def figures(avatar: Avatar, capture: Capture, most: int) -> dict[str, float]:
+    """PSNR over the subject's box in decibels, by split."""
+    with torch.no_grad():
+        splits = {name: measure_split(avatar, capture, name, most)["psnr_box"] for name in ("novel_view", "novel_pose")}
+    return {name: float(value) for name, value in splits.items()}  # type: ignore[arg-type]
+
+
+def train_reference(capture: Capture, small: Capture, seconds: float) -> dict[str, object]:
+    """What the reference form reaches in some seconds; a step that has begun is finished."""
+    recipe = reference()
+    recipe = replace(recipe, training=replace(recipe.training, preview_every=0))
+    begun = time.perf_counter()
+    built: list[Avatar] = []
+    steps = 0
+
+    def watch(progress: loop.Progress) -> None:
+        nonlocal steps
+        steps = progress.step
+        if time.perf_counter() - begun >= seconds:
+            raise OutOfTime
+
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(OutOfTime):
+        loop.train(capture, recipe, Path(folder) / "run", torch.device("cpu"), watch=watch, before_first=built.append)
+    taken = time.perf_counter() - begun
+    return {"steps": steps, "seconds": taken, "small": figures(built[0].eval(), small, 2)}
 
 
 def main() -> None:
@@ -33,6 +73,7 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     tune_process()
     capture = studio_capture(arguments.size, 50, 4, arguments.seed)
+    small = studio_capture(SMALL, 50, 4, arguments.seed)
     recipe = demo_recipe(arguments.seed)
     recipe = replace(recipe, training=replace(recipe.training, steps=arguments.steps))
     every = max(arguments.steps // arguments.points, 1)
@@ -46,10 +87,7 @@ def main() -> None:
         if progress.step % every == 0:
             start = time.perf_counter()
             avatar = built[0].eval()
-            point = {"step": progress.step, "seconds": start - begun - measuring}
-            with torch.no_grad():
-                for split in ("novel_view", "novel_pose"):
-                    point[split] = float(measure_split(avatar, capture, split, 6)["psnr_box"])  # type: ignore[arg-type]
+            point = {"step": progress.step, "seconds": start - begun - measuring, **figures(avatar, capture, 6)}
             avatar.train()
             curve.append(point)
             print(point, flush=True)
@@ -57,10 +95,13 @@ def main() -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         loop.train(capture, recipe, Path(folder) / "run", torch.device("cpu"), watch=watch, before_first=built.append)
+    ours = figures(built[0].eval(), small, 2)
+    theirs = train_reference(capture, small, curve[-1]["seconds"])
     store(
         f"quality-cpu-{arguments.threads}threads-seed{arguments.seed}",
         {"what": "PSNR over the subject's box against seconds of training (measuring not counted)",
-         "threads": arguments.threads, "seed": arguments.seed, "size": arguments.size, "curve": curve},
+         "threads": arguments.threads, "seed": arguments.seed, "size": arguments.size, "curve": curve,
+         "small_size": SMALL, "small": ours, "reference": theirs},
     )  # fmt: skip
 
 

@@ -78,6 +78,8 @@ def quick() -> Recipe:
                 eikonal=0.05, mask=0.3, mask_form="mean", s3im=0.0, lpips=0.0, common=0.5, eikonal_points=512
             ),
             pose=PoseConfig(zero_until=200, zero_every=0, drop=0.2, refine_from=200),
+            neighbours=6,
+            falloff="smooth",
             beta=0.01,
             beta_floor=1.5e-3,
             shell_refresh=400,

@@ -13,6 +13,7 @@ from twofold.deform.skinning import (
     inverse_skinning,
     invert_affine,
     neighbour_weights,
+    smooth_neighbour_weights,
     to_canonical,
     to_posed,
     vertex_transforms,
@@ -166,3 +167,27 @@ def test_shares_are_the_definition_and_sum_to_one(seed, k):
         raw = [math.exp(-min(d, 4)) for d in row]
         torch.testing.assert_close(found, torch.tensor([r / sum(raw) for r in raw], dtype=torch.float64))
     torch.testing.assert_close(shares.sum(-1), torch.ones(4, dtype=torch.float64))
+
+
+def test_smooth_shares_are_the_definition_and_forget_the_last():
+    shares = smooth_neighbour_weights(torch.tensor([[0.0, 1.0, 2.0, 4.0]], dtype=torch.float64))
+    raw = torch.tensor([[1.0, 0.5625, 0.25, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(shares, raw / raw.sum(), atol=1e-5, rtol=0)
+    for alike in (torch.zeros(1, 3), torch.ones(1, 3), torch.ones(1, 1)):
+        torch.testing.assert_close(smooth_neighbour_weights(alike), torch.full_like(alike, 1 / alike.shape[1]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_points_beside_each_other_are_carried_alike_by_smooth_shares(seed):
+    """Where the nearest vertex changes, points carried by one vertex alone are torn apart."""
+    body = posed_little_body(seed, 0.3, torch.float64)
+    forward = vertex_transforms(body)
+    a, b = near_the_body(body, 2, 0.03, seed)
+    x = a + torch.linspace(0, 1, 20_001, dtype=torch.float64)[:, None] * (b - a)
+    steps = {}
+    for k, weigh in ((1, neighbour_weights), (6, neighbour_weights), (6, smooth_neighbour_weights)):
+        squared, nearest = torch.cdist(x, body.vertices).square().topk(k, largest=False)
+        home, _ = to_canonical(x, nearest, weigh(squared), forward)
+        steps[k, weigh] = (home[1:] - home[:-1]).norm(dim=-1).max()
+    torn = min(steps[1, neighbour_weights], steps[6, neighbour_weights])
+    assert steps[6, smooth_neighbour_weights] < 0.2 * torn

@@ -7,11 +7,11 @@ import torch
 from small_recipes import CASES
 
 from twofold.deform.shell import build_shell
-from twofold.deform.skinning import to_canonical
+from twofold.deform.skinning import neighbour_weights
 from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods import factorized
 from twofold.methods.base import Subject
-from twofold.methods.placing import ShellSampler, place_in_shell, without_strays
+from twofold.methods.placing import ShellSampler, astray, carried_home, place_in_shell
 from twofold.train.loop import train
 
 BLACK = torch.zeros(3)
@@ -96,22 +96,35 @@ def test_samples_that_are_carried_to_another_part_are_air(dense, person):
         posed = dense.pose(frame.pose, frame.translation)
     rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
     sampler = dense.config.sampler
-    placed = place_in_shell(sampler, rays, posed, 1, sampler.radius, None)
+    placed = place_in_shell(sampler, rays, posed, 1, neighbour_weights, sampler.radius, None)
+    x = carried_home(placed, rays, posed)
     home = build_shell(dense.canonical_points, posed.body.faces, sampler.radius, sampler.voxel)
-    kept = without_strays(placed, rays, posed, home, 0.006)
-
-    def nearer(some):
-        points = some.samples.points(rays)
-        x, _ = to_canonical(points, some.nearest, some.shares, posed.forward)
-        away = (points - posed.body.vertices[some.nearest[:, 0]]).norm(dim=-1)
-        return away - torch.cdist(x, dense.canonical_points).amin(1)
-
-    assert 0 < len(kept.samples) < len(placed.samples)
-    assert (nearer(placed) > 0.02).any()
+    stray = astray(placed, x, rays, posed, home, 0.006)
+    away = (placed.samples.points(rays) - posed.body.vertices[placed.nearest[:, 0]]).norm(dim=-1)
+    nearer = away - torch.cdist(x, dense.canonical_points).amin(1)
+    assert 0 < stray.sum() < len(stray)
+    assert nearer.max() > 0.02
+    assert (nearer[stray] > 0.0059).all()
     # What a voxel does not list may still be nearer, hence not all.
-    assert (nearer(kept) < 0.0061).float().mean() > 0.99
-    everything = without_strays(placed, rays, posed, home, 1.0)
-    assert len(everything.samples) == len(placed.samples)
+    assert (nearer[~stray] < 0.0061).float().mean() > 0.99
+    assert not astray(placed, x, rays, posed, home, 1.0).any()
+
+
+def test_strays_are_air_in_training_and_in_pictures(person):
+    recipe = CASES["quick"]
+    frame = person.train[1]
+    rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
+    counts = {}
+    for stray in (0.0, 0.006):
+        sampler = replace(recipe.method.sampler, stray=stray, least_weight=0.0)
+        avatar = replace(recipe.method, sampler=sampler).build(Subject.of(person))
+        for training in (True, False):
+            avatar.train(training)
+            posed = avatar.pose(frame.pose, frame.translation, frame.time, 5 if training else None)
+            noise = torch.Generator().manual_seed(0) if training else None
+            counts[stray, training] = len(avatar._place(rays, posed, noise).samples)
+    assert 0 < counts[0.006, True] < counts[0.0, True]
+    assert 0 < counts[0.006, False] < counts[0.0, False]
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,17 @@ def neighbour_weights(squared_distances: Float[Tensor, "S K"]) -> Float[Tensor, 
     return torch.softmax(-squared_distances.clamp_max(4.0), -1)
 
 
+def smooth_neighbour_weights(squared_distances: Float[Tensor, "S K"]) -> Float[Tensor, "S K"]:
+    """Share of each of the K nearest vertices, (1 - d^2 / d_K^2)^2 normalised, so that the last one counts nothing.
+
+    A vertex that comes among the nearest, or leaves them, does so with weight zero, so neighbouring points are carried
+    alike. Points as far from all K take their mean.
+    """
+    farthest = squared_distances.amax(-1, keepdim=True)
+    raw = (1 - squared_distances / farthest.clamp_min(1e-12)).square() + 1e-6
+    return raw / raw.sum(-1, keepdim=True)
+
+
 def to_canonical(
     x_posed: Float[Tensor, "S 3"],
     nearest: Int[Tensor, "S K"],

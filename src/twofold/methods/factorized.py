@@ -17,7 +17,12 @@ from twofold.capture.pixels import Batch
 from twofold.config import require_within
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.deform.shell import Shell, build_shell
-from twofold.deform.skinning import to_canonical, vertex_transforms
+from twofold.deform.skinning import (
+    neighbour_weights,
+    smooth_neighbour_weights,
+    to_canonical,
+    vertex_transforms,
+)
 from twofold.field.distance_table import DistanceTable, tabulate
 from twofold.field.factorized import FactorizedField, FactorizedFieldConfig
 from twofold.field.factorized_grid import GridField, GridFieldConfig
@@ -29,10 +34,11 @@ from twofold.methods.placing import (
     Distance,
     Placed,
     ShellSampler,
-    only_seen,
+    astray,
+    carried_home,
     place_error_bounded,
     place_in_shell,
-    without_strays,
+    seen_in_shell,
 )
 from twofold.metrics.perceptual import LPIPS
 from twofold.speed import compiled_methods
@@ -108,6 +114,9 @@ class FactorizedConfig:
     pose: PoseConfig = dataclasses.field(default_factory=PoseConfig)
     neighbours: int = 1
     """How many nearest vertices give a point its skinning weights."""
+    falloff: Literal["exponential", "smooth"] = "exponential"
+    """How these count by distance: "exponential" as in Vid2Avatar, nearly alike in metres; "smooth" falls to nothing at
+    the last of them, so that points beside each other are carried home alike."""
     beta: float = 0.1
     """Initial scale of the density, metres."""
     beta_floor: float = 1e-4
@@ -307,17 +316,24 @@ class FactorizedAvatar(Avatar):
         def distance(x_canonical: Tensor) -> Tensor:
             return self.field.sdf(x_canonical, posed.condition)
 
+        weigh = neighbour_weights if self.config.falloff == "exponential" else smooth_neighbour_weights
         if isinstance(sampler, ErrorBoundedSampler):
-            placed = place_error_bounded(sampler, rays, posed, k, limit, generator, distance, self.beta)
+            placed = place_error_bounded(sampler, rays, posed, k, weigh, limit, generator, distance, self.beta)
             shading = self.config.outliers_in_shading and generator is None
             return replace(placed, outlier=placed.outlier & shading)
-        placed = place_in_shell(sampler, rays, posed, k, min(sampler.radius, limit), generator)
-        if sampler.stray > 0 and not self.training and generator is None and len(placed.samples):
-            placed = without_strays(placed, rays, posed, self._canonical_shell(sampler, posed), sampler.stray)
-        if sampler.least_weight == 0 or len(placed.samples) == 0:
+        placed = place_in_shell(sampler, rays, posed, k, weigh, min(sampler.radius, limit), generator)
+        if len(placed.samples) == 0 or sampler.stray == sampler.least_weight == 0:
             return placed
-        table = None if self.training or generator is not None else self._table(len(placed.samples), posed, distance)
-        return only_seen(placed, rays, posed, distance, self.beta, sampler.least_weight, table)
+        x_canonical = carried_home(placed, rays, posed)
+        if sampler.stray > 0:
+            home = self._canonical_shell(sampler, posed)
+            kept = (~astray(placed, x_canonical, rays, posed, home, sampler.stray)).nonzero()[:, 0]
+            placed, x_canonical = placed[kept], x_canonical[kept]
+        if sampler.least_weight > 0:
+            table = None if self.training or generator is not None else self._table(len(x_canonical), posed, distance)
+            weight = sampler.least_weight
+            placed = placed[seen_in_shell(placed, x_canonical, len(rays), distance, self.beta, weight, table)]
+        return placed
 
     def _canonical_shell(self, sampler: ShellSampler, posed: PosedAvatar) -> Shell:
         if self._home is None or self._home.vertices.device != self.device:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from twofold.config import require_within
 from twofold.deform.shell import Shell, nearest_listed, sample_shell
-from twofold.deform.skinning import neighbour_weights, to_canonical
+from twofold.deform.skinning import to_canonical
 from twofold.field.distance_table import DistanceTable
 from twofold.geometry.cameras import Rays, clip_to_box
 from twofold.geometry.samples import Samples
@@ -21,6 +21,8 @@ from twofold.volume.samplers import ErrorBoundedSampler
 
 Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 """A field's signed distance at canonical points, metres."""
+Shares = Callable[[Float[Tensor, "S K"]], Float[Tensor, "S K"]]
+"""The weights of the K nearest vertices by their squared distances, metres squared."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,8 @@ class ShellSampler:
     least_weight: float = 1e-3
     """Samples that a pass without gradients finds to add less than this to their pixel are left out; 0 keeps all."""
     stray: float = 0.0
-    """Pictures: samples that come closer to the body by more than this when they are carried home, metres, are air; 0
-    keeps them. Not for a field that is no person yet."""
+    """Samples that come closer to the body by more than this when they are carried home, metres, are air; 0 keeps
+    them. Not for a field that starts as a sphere."""
     table_voxel: float = 0.015
     """Pictures from dense networks: spacing of a lattice of distances, asked once a pose, that tells most samples to be
     empty or hidden before the networks are asked; metres, 0 asks the networks about every sample."""
@@ -74,7 +76,7 @@ class Placed:
 
 
 def place_in_shell(
-    sampler: ShellSampler, rays: Rays, posed: PosedAvatar, neighbours: int, limit: float,
+    sampler: ShellSampler, rays: Rays, posed: PosedAvatar, neighbours: int, shares: Shares, limit: float,
     generator: torch.Generator | None,
 ) -> Placed:  # fmt: skip
     """Every sample of the rays within `limit` metres of the body; a generator moves each ray's comb at random."""
@@ -83,60 +85,63 @@ def place_in_shell(
         points = samples.points(rays).detach()
         nearest, squared = nearest_listed(posed.shell, points, posed.shell.rows_at(points), neighbours)
     outlier = torch.zeros(len(samples), dtype=torch.bool, device=squared.device)
-    return Placed(samples, nearest, neighbour_weights(squared), outlier)
+    return Placed(samples, nearest, shares(squared), outlier)
 
 
 @torch.no_grad()
-def without_strays(placed: Placed, rays: Rays, posed: PosedAvatar, canonical: Shell, slack: float) -> Placed:
-    """Without samples that inverse skinning carries to a part of the body that they are not at.
+def carried_home(placed: Placed, rays: Rays, posed: PosedAvatar) -> Float[Tensor, "S 3"]:
+    """Where the samples are in canonical space, to choose among them; without gradients."""
+    return to_canonical(placed.samples.points(rays), placed.nearest, placed.shares, posed.forward)[0]
+
+
+@torch.no_grad()
+def astray(
+    placed: Placed, x_canonical: Float[Tensor, "S 3"], rays: Rays, posed: PosedAvatar, canonical: Shell, slack: float
+) -> Bool[Tensor, "S"]:
+    """Samples that inverse skinning carries to a part of the body that they are not at.
 
     Air beside the neck belongs to the shoulder below it. Carried home by a lowered arm it ends up inside the head. So a
     sample that comes closer to the canonical body than it was to the posed one, by more than `slack` metres, is air.
     """
-    points = placed.samples.points(rays)
-    away = (points - posed.body.vertices[placed.nearest[:, 0]]).norm(dim=-1)
-    far = (away > slack).nonzero()[:, 0]
-    part = placed[far]
-    x_canonical, _ = to_canonical(points[far], part.nearest, part.shares, posed.forward)
+    away = (placed.samples.points(rays) - posed.body.vertices[placed.nearest[:, 0]]).norm(dim=-1)
     rows = canonical.rows_at(x_canonical)
-    near = (rows >= 0).nonzero()[:, 0]
+    near = ((away > slack) & (rows >= 0)).nonzero()[:, 0]
     _, squared = nearest_listed(canonical, x_canonical[near], rows[near], 1)
-    stray = torch.zeros(len(placed.samples), dtype=torch.bool, device=away.device)
-    stray[far[near]] = squared[:, 0].sqrt() < away[far[near]] - slack
-    return placed[(~stray).nonzero()[:, 0]]
+    stray = torch.zeros(len(away), dtype=torch.bool, device=away.device)
+    stray[near] = squared[:, 0].sqrt() < away[near] - slack
+    return stray
 
 
 @torch.no_grad()
-def only_seen(
-    placed: Placed, rays: Rays, posed: PosedAvatar, distance: Distance, beta: Float[Tensor, ""], least: float,
-    table: DistanceTable | None = None,
-) -> Placed:  # fmt: skip
-    """Those of the samples that add more than `least` to their pixel.
+def seen_in_shell(
+    placed: Placed, x_canonical: Float[Tensor, "S 3"], rays: int, distance: Distance, beta: Float[Tensor, ""],
+    least: float, table: DistanceTable | None = None,
+) -> Int[Tensor, "n"]:  # fmt: skip
+    """Which of the samples add more than `least` to their pixel.
 
     Args:
         placed: all samples.
-        rays: that they lie on.
-        posed: carries them home.
+        x_canonical: the same, carried home.
+        rays: how many these lie on.
         distance: of the field.
         beta: scale of the density, metres.
         least: a weight (`composite_weights`).
         table: of the same field in the same pose; what it knows to be empty or hidden is not asked.
     """
-    x_canonical, _ = to_canonical(placed.samples.points(rays), placed.nearest, placed.shares, posed.forward)
+    asked = torch.arange(len(x_canonical), device=x_canonical.device)
     if table is not None:
         nearer, further = table.bounds(x_canonical)
         most, fewest = laplace_density(nearer, beta), laplace_density(further, beta)
-        possible = possible_samples(placed.samples, fewest, most, least).nonzero()[:, 0]
-        placed, x_canonical = placed[possible], x_canonical[possible]
+        asked = possible_samples(placed.samples, fewest, most, least).nonzero()[:, 0]
 
     def density(index: Tensor) -> Tensor:
-        return laplace_density(distance(x_canonical[index]), beta)
+        return laplace_density(distance(x_canonical[asked[index]]), beta)
 
-    return placed[seen_samples(placed.samples, density, len(rays), least)]
+    return asked[seen_samples(placed.samples[asked], density, rays, least)]
 
 
 def place_error_bounded(
-    sampler: ErrorBoundedSampler, rays: Rays, posed: PosedAvatar, neighbours: int, limit: float,
+    sampler: ErrorBoundedSampler, rays: Rays, posed: PosedAvatar, neighbours: int, shares: Shares, limit: float,
     generator: torch.Generator | None, distance: Distance, beta: Float[Tensor, ""],
 ) -> Placed:  # fmt: skip
     """Samples in the box of the joints by the error-bounded sampler.
@@ -146,6 +151,7 @@ def place_error_bounded(
         rays: to place samples on.
         posed: the body.
         neighbours: how many nearest vertices carry a sample home.
+        shares: weighs these.
         limit: samples further than this from the body are outliers, metres.
         generator: places them at random (training); None evenly.
         distance: of the field.
@@ -165,7 +171,7 @@ def place_error_bounded(
 
     def sdf(points: Tensor) -> Tensor:
         index, apart = nearest_to(points)
-        x_canonical, _ = to_canonical(points, index, neighbour_weights(apart**2), posed.forward.detach())
+        x_canonical, _ = to_canonical(points, index, shares(apart**2), posed.forward.detach())
         value = distance(x_canonical)
         # The release treats outliers as empty only when it does not train.
         return value if generator is not None else torch.where(apart[:, 0] > limit, 4.0, value)
@@ -174,4 +180,4 @@ def place_error_bounded(
         samples = sampler.sample(clipped[inside], sdf, beta, generator, generator is not None)
     samples = Samples(inside[samples.ray_index], samples.depth, samples.delta)
     index, apart = nearest_to(samples.points(rays))
-    return Placed(samples, index, neighbour_weights(apart**2), apart[:, 0] > limit)
+    return Placed(samples, index, shares(apart**2), apart[:, 0] > limit)
