@@ -11,6 +11,7 @@ from PIL import Image
 
 from twofold import evaluate
 from twofold.capture.types import Capture, Frame
+from twofold.deform.pose_refinement import PoseRefinement
 from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
 from twofold.outputs.views import Picture
@@ -46,3 +47,33 @@ def test_what_is_ignored_spoils_no_figure_and_its_share_is_told(capture, monkeyp
     assert figures["ssim_box"] == pytest.approx(1)
     assert figures["protocol"]["ignored"].startswith("8.3 % of the box on average")
     assert "ignored" not in evaluate.measure_split(avatar, capture, "train")["protocol"]
+
+
+def refined_avatar(parts):
+    return Mock(spec=Avatar, refinement=PoseRefinement(torch.tensor([0]), 2, parts))
+
+
+def test_what_refined_poses_change_is_told_before_and_after(capture, monkeypatch):
+    def drawn(avatar, capture, frame, refined):
+        image, mask = evaluate.truth(frame, capture.background)
+        color, opacity = image * (0.9 if refined else 0.5), mask.clone()
+        opacity[:14] *= refined
+        return Picture(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
+
+    monkeypatch.setattr(evaluate, "draw_frame", drawn)
+    figures = evaluate.measure_refinement(refined_avatar(("root", "translation")), capture, 8)
+    told = figures.pop("protocol")
+    assert told.keys() == figures.keys() > {"root", "body", "translation", "shape"}
+    # Colours are rounded to eight bits.
+    gained = figures["train_psnr_box_after"] - figures["train_psnr_box_before"]
+    assert gained == pytest.approx(20 * np.log10(5), abs=0.2)
+    assert (figures["train_silhouette_iou_before"], figures["train_silhouette_iou_after"]) == (pytest.approx(0.8), 1)
+    # Of the two held out, one hides most of what is missing.
+    assert figures["held_out_silhouette_iou_before"] == pytest.approx((0.8 + 192 / 200) / 2)
+    assert "poses of the capture" in told["held_out_psnr_box_before"]
+
+
+def test_without_refinement_there_is_no_before_and_after(capture):
+    figures = evaluate.measure_refinement(refined_avatar(()), capture, 8)
+    assert figures.keys() == {"root", "body", "translation", "shape", "protocol"}
+    assert figures["root"] == figures["shape"] == 0

@@ -141,6 +141,27 @@ def measure_geometry(
     return means
 
 
+def measure_refinement(avatar: Avatar, capture: Capture, most: int) -> dict[str, object]:
+    """How far training moved the poses, and the same avatar in the poses before and after, in at most `most` pictures.
+
+    Held-out moments are of the split "novel_pose"; without a training moment near them their poses stay as they are.
+    """
+    refinement = avatar.refinement
+    assert isinstance(refinement, PoseRefinement)
+    found: dict[str, object] = dict(refinement.change())
+    told = {"shape": "length of the change of the coefficients"}
+    for name, unit in (("root", "radians"), ("body", "radians"), ("translation", "metres")):
+        told[name] = f"root mean square change over the training moments, {unit}"
+    poses = {"before": "the poses of the capture", "after": "the poses that training made of them"}
+    for split, called in (("train", "train"), ("novel_pose", "held_out")):
+        for when in poses if refinement.parts else ():
+            figures = measure_split(avatar, capture, split, most, when == "after")
+            for figure in ("psnr_box", "silhouette_iou") if figures else ():
+                found[f"{called}_{figure}_{when}"] = figures[figure]
+                told[f"{called}_{figure}_{when}"] = f"up to {most} pictures of the split {split} in {poses[when]}"
+    return found | {"protocol": told}
+
+
 def evaluate(
     avatar: Avatar, capture: Capture, folder: Path, most: int | None = None, meshes: int | None = 4,
     watch: Callable[[str, Frame, Picture], None] | None = None, extra: dict[str, object] | None = None,
@@ -167,13 +188,8 @@ def evaluate(
     geometry = measure_geometry(avatar, capture, meshes)
     if geometry:
         metrics["geometry"] = geometry
-    refinement = getattr(avatar, "refinement", None)
-    if refinement is not None:
-        metrics["pose_refinement"] = {
-            **refinement.change(),
-            "protocol": "root mean square change of root and body rotations (radians) and translation (metres) over "
-            "the training moments; shape: length of the change of the coefficients",
-        }
+    if isinstance(getattr(avatar, "refinement", None), PoseRefinement):
+        metrics["pose_refinement"] = measure_refinement(avatar, capture, min(most or 8, 8))
     metrics |= extra or {}
     write_json(folder / "metrics.json", metrics)
     return metrics
