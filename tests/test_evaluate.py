@@ -15,6 +15,7 @@ from twofold.deform.pose_refinement import PoseRefinement
 from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
 from twofold.outputs.views import Picture
+from twofold.train.run import load
 
 
 @pytest.fixture
@@ -77,3 +78,15 @@ def test_without_refinement_there_is_no_before_and_after(capture):
     figures = evaluate.measure_refinement(refined_avatar(()), capture, 8)
     assert figures.keys() == {"root", "body", "translation", "shape", "protocol"}
     assert figures["root"] == figures["shape"] == 0
+
+
+def test_progress_goes_to_the_end_and_no_further(trained, tmp_path):
+    avatar, _ = load(trained.folder)
+    told = []
+    metrics = evaluate.evaluate(avatar, trained.capture, tmp_path, 2, 1, lambda share, what: told.append((share, what)))
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1)
+    assert all(before < 1 for before in shares[:-1])
+    sections = {name for name in metrics if name != "pose_refinement"}
+    assert {what for _, what in told} == sections | {"pose refinement"}

@@ -184,16 +184,8 @@ def evaluate(
     avatar, _ = load(run, choose_device(device))
     read = read_capture(find_capture(run, capture))
     require_same(run, read, motion=True)
-    count = sum(min(len(read.splits.get(s, ())), most or 10**9) for s in ("novel_view", "novel_pose"))
-    done = 0
-
-    def watch(split: str, frame: object, picture: object) -> None:
-        nonlocal done
-        done += 1
-        show(done / max(count, 1), split)
-
     with bar("Measuring") as show:
-        metrics = measure(avatar, read, run, most, meshes, watch)
+        metrics = measure(avatar, read, run, most, meshes, show)
     for section, values in metrics.items():
         if isinstance(values, dict):
             numbers = {k: v for k, v in values.items() if isinstance(v, float)}

@@ -26,6 +26,8 @@ def truth(frame: Frame, background: tuple[float, float, float]) -> tuple[Tensor,
 
 NEAR = 0.5
 """Seconds over which the errors of an estimator's poses last."""
+_MESH = 4
+"""Pictures that can be measured while one surface is."""
 
 
 def draw_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) -> Picture:
@@ -112,15 +114,18 @@ def _level(avatar: Avatar, posed: PosedAvatar, x: Tensor) -> Tensor:
     return avatar.level(x.to(posed.forward.device), posed)
 
 
-def measure_geometry(
-    avatar: Avatar, capture: Capture, most: int | None = None, voxel: float = 0.008
-) -> dict[str, object]:
-    """Means of the surface figures over the moments whose true mesh is known; empty where none is."""
+def _with_mesh(capture: Capture, most: int | None) -> dict[int, Frame]:
     moments = {f.time: f for split in ("novel_view", "novel_pose", "train") for f in capture.splits.get(split, ())}
-    times = spread([time for time in sorted(capture.meshes) if time in moments], most)
+    return {time: moments[time] for time in spread([t for t in sorted(capture.meshes) if t in moments], most)}
+
+
+def measure_geometry(
+    avatar: Avatar, capture: Capture, most: int | None = None, voxel: float = 0.008,
+    watch: Callable[[], None] | None = None,
+) -> dict[str, object]:  # fmt: skip
+    """Means of the surface figures over the moments whose true mesh is known; empty where none is."""
     rows = []
-    for time in times:
-        frame = moments[time]
+    for time, frame in _with_mesh(capture, most).items():
         posed = avatar.pose(frame.pose, frame.translation, None)
         surface, faces = extract_surface(functools.partial(_level, avatar, posed), posed.body.canonical_vertices, voxel)
         vertices = pose_surface(surface, posed.body)
@@ -129,6 +134,8 @@ def measure_geometry(
         rows.append(
             shape_metrics.compare_surfaces(vertices.cpu(), faces.cpu(), true_vertices.float(), true_faces.long())
         )
+        if watch:
+            watch()
     if not rows:
         return {}
     means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
@@ -141,7 +148,9 @@ def measure_geometry(
     return means
 
 
-def measure_refinement(avatar: Avatar, capture: Capture, most: int) -> dict[str, object]:
+def measure_refinement(
+    avatar: Avatar, capture: Capture, most: int, watch: Callable[[Frame, Picture], None] | None = None
+) -> dict[str, object]:
     """How far training moved the poses, and the same avatar in the poses before and after, in at most `most` pictures.
 
     Held-out moments are of the split "novel_pose"; without a training moment near them their poses stay as they are.
@@ -155,7 +164,7 @@ def measure_refinement(avatar: Avatar, capture: Capture, most: int) -> dict[str,
     poses = {"before": "the poses of the capture", "after": "the poses that training made of them"}
     for split, called in (("train", "train"), ("novel_pose", "held_out")):
         for when in poses if refinement.parts else ():
-            figures = measure_split(avatar, capture, split, most, when == "after")
+            figures = measure_split(avatar, capture, split, most, when == "after", watch)
             for figure in ("psnr_box", "silhouette_iou") if figures else ():
                 found[f"{called}_{figure}_{when}"] = figures[figure]
                 told[f"{called}_{figure}_{when}"] = f"up to {most} pictures of the split {split} in {poses[when]}"
@@ -164,7 +173,7 @@ def measure_refinement(avatar: Avatar, capture: Capture, most: int) -> dict[str,
 
 def evaluate(
     avatar: Avatar, capture: Capture, folder: Path, most: int | None = None, meshes: int | None = 4,
-    watch: Callable[[str, Frame, Picture], None] | None = None, extra: dict[str, object] | None = None,
+    show: Callable[[float, str], None] | None = None, extra: dict[str, object] | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """Measures everything that the capture knows the truth of and writes `metrics.json` into the run.
 
@@ -174,22 +183,33 @@ def evaluate(
         folder: the run.
         most: at most so many pictures a split.
         meshes: at most so many true meshes.
-        watch: called with the split, frame and rendering of each test picture.
+        show: told the share that is done and what is being measured.
         extra: further sections for the file.
     """
+    few = min(most or 8, 8)
+    pictures = {name: len(spread(capture.splits.get(name, ()), most)) for name in ("novel_view", "novel_pose")}
+    pictures["train"] = len(spread(capture.train, few))
+    refined = 2 * (pictures["train"] + min(pictures["novel_pose"], few)) if _refines(avatar) else 0
+    to_do = sum(pictures.values()) + refined + _MESH * len(_with_mesh(capture, meshes))
+    done = 0
+
+    def watch(what: str, pictures: int = 1) -> None:
+        nonlocal done
+        done += pictures
+        if show:
+            show(done / max(to_do, 1), what)
+
     metrics: dict[str, object] = {}
-    for split in ("novel_view", "novel_pose"):
-        part = measure_split(
-            avatar, capture, split, most, True, (lambda f, p, s=split: watch(s, f, p)) if watch else None
-        )
-        if part:
+    for split in pictures:
+        count = few if split == "train" else most
+        part = measure_split(avatar, capture, split, count, True, lambda f, p, s=split: watch(s))
+        if part or split == "train":
             metrics[split] = part
-    metrics["train"] = measure_split(avatar, capture, "train", min(most or 8, 8), refined=True)
-    geometry = measure_geometry(avatar, capture, meshes)
+    geometry = measure_geometry(avatar, capture, meshes, watch=lambda: watch("geometry", _MESH))
     if geometry:
         metrics["geometry"] = geometry
     if isinstance(getattr(avatar, "refinement", None), PoseRefinement):
-        metrics["pose_refinement"] = measure_refinement(avatar, capture, min(most or 8, 8))
+        metrics["pose_refinement"] = measure_refinement(avatar, capture, few, lambda f, p: watch("pose refinement"))
     metrics |= extra or {}
     write_json(folder / "metrics.json", metrics)
     return metrics
