@@ -34,11 +34,9 @@ from twofold.methods.placing import (
     Distance,
     Placed,
     ShellSampler,
-    astray,
-    carried_home,
     place_error_bounded,
     place_in_shell,
-    seen_in_shell,
+    that_count,
 )
 from twofold.metrics.perceptual import LPIPS
 from twofold.speed import compiled_methods
@@ -322,18 +320,9 @@ class FactorizedAvatar(Avatar):
             shading = self.config.outliers_in_shading and generator is None
             return replace(placed, outlier=placed.outlier & shading)
         placed = place_in_shell(sampler, rays, posed, k, weigh, min(sampler.radius, limit), generator)
-        if len(placed.samples) == 0 or sampler.stray == sampler.least_weight == 0:
-            return placed
-        x_canonical = carried_home(placed, rays, posed)
-        if sampler.stray > 0:
-            home = self._canonical_shell(sampler, posed)
-            kept = (~astray(placed, x_canonical, rays, posed, home, sampler.stray)).nonzero()[:, 0]
-            placed, x_canonical = placed[kept], x_canonical[kept]
-        if sampler.least_weight > 0:
-            table = None if self.training or generator is not None else self._table(len(x_canonical), posed, distance)
-            weight = sampler.least_weight
-            placed = placed[seen_in_shell(placed, x_canonical, len(rays), distance, self.beta, weight, table)]
-        return placed
+        home = self._canonical_shell(sampler, posed) if sampler.stray > 0 else None
+        table = None if self.training or generator is not None else lambda count: self._table(count, posed, distance)
+        return that_count(sampler, placed, rays, posed, home, distance, self.beta, table)
 
     def _canonical_shell(self, sampler: ShellSampler, posed: PosedAvatar) -> Shell:
         if self._home is None or self._home.vertices.device != self.device:

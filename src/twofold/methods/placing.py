@@ -88,6 +88,35 @@ def place_in_shell(
     return Placed(samples, nearest, shares(squared), outlier)
 
 
+def that_count(
+    sampler: ShellSampler, placed: Placed, rays: Rays, posed: PosedAvatar, home: Shell | None, distance: Distance,
+    beta: Float[Tensor, ""], table: Callable[[int], DistanceTable | None] | None,
+) -> Placed:  # fmt: skip
+    """The samples that the networks are worth asking about: no strays, none that is known to be empty or hidden.
+
+    Args:
+        sampler: says which of these checks are made.
+        placed: all samples.
+        rays: that they lie on.
+        posed: carries them home.
+        home: of the canonical body, for the strays; None leaves them.
+        distance: of the field.
+        beta: scale of the density, metres.
+        table: gives a table of distances where that pays for so many samples; None never.
+    """
+    if len(placed.samples) == 0 or (home is None and sampler.least_weight == 0):
+        return placed
+    x_canonical = carried_home(placed, rays, posed)
+    if home is not None:
+        kept = (~astray(placed, x_canonical, rays, posed, home, sampler.stray)).nonzero()[:, 0]
+        placed, x_canonical = placed[kept], x_canonical[kept]
+    if sampler.least_weight > 0:
+        known = table(len(x_canonical)) if table else None
+        seen = seen_in_shell(placed, x_canonical, len(rays), distance, beta, sampler.least_weight, known)
+        placed = placed[seen]
+    return placed
+
+
 @torch.no_grad()
 def carried_home(placed: Placed, rays: Rays, posed: PosedAvatar) -> Float[Tensor, "S 3"]:
     """Where the samples are in canonical space, to choose among them; without gradients."""
