@@ -227,6 +227,11 @@ def warnings_about(yaw: float, moved: float, width: int, dropped: Sequence[int],
             f"The background moves by up to {moved:.0f} pixels: the camera does not stand still. Everything is told "
             "relative to it, so the person seems to sway; put the camera on something firm."
         )
+    if several:
+        words.append(
+            "Several cameras agree on these poses; the one that trains cannot see their depth. Train with "
+            "--set training.rate_pose=1e-4, so that they move little."
+        )
     if dropped:
         words.append(f"{len(dropped)} moments were left out: {spans(dropped)}.")
     return words
