@@ -149,11 +149,13 @@ def measure_geometry(
 
 
 def measure_refinement(
-    avatar: Avatar, capture: Capture, most: int, watch: Callable[[Frame, Picture], None] | None = None
-) -> dict[str, object]:
+    avatar: Avatar, capture: Capture, most: int, trained: dict[str, object] | None = None,
+    watch: Callable[[Frame, Picture], None] | None = None,
+) -> dict[str, object]:  # fmt: skip
     """How far training moved the poses, and the same avatar in the poses before and after, in at most `most` pictures.
 
     Held-out moments are of the split "novel_pose"; without a training moment near them their poses stay as they are.
+    `trained` are the training pictures' figures in the poses after, where the caller has them already.
     """
     refinement = avatar.refinement
     assert isinstance(refinement, PoseRefinement)
@@ -162,9 +164,10 @@ def measure_refinement(
     for name, unit in (("root", "radians"), ("body", "radians"), ("translation", "metres")):
         told[name] = f"root mean square change over the training moments, {unit}"
     poses = {"before": "the poses of the capture", "after": "the poses that training made of them"}
-    for split, called in (("train", "train"), ("novel_pose", "held_out")):
+    for split, called, known in (("train", "train", trained), ("novel_pose", "held_out", None)):
         for when in poses if refinement.parts else ():
-            figures = measure_split(avatar, capture, split, most, when == "after", watch)
+            after = when == "after"
+            figures = known if known and after else measure_split(avatar, capture, split, most, after, watch)
             for figure in ("psnr_box", "silhouette_iou") if figures else ():
                 found[f"{called}_{figure}_{when}"] = figures[figure]
                 told[f"{called}_{figure}_{when}"] = f"up to {most} pictures of the split {split} in {poses[when]}"
@@ -189,7 +192,8 @@ def evaluate(
     few = min(most or 8, 8)
     pictures = {name: len(spread(capture.splits.get(name, ()), most)) for name in ("novel_view", "novel_pose")}
     pictures["train"] = len(spread(capture.train, few))
-    refined = 2 * (pictures["train"] + min(pictures["novel_pose"], few)) if _refines(avatar) else 0
+    # Training pictures are drawn once more, in the poses as given; held-out ones in both.
+    refined = pictures["train"] + 2 * min(pictures["novel_pose"], few) if _refines(avatar) else 0
     to_do = sum(pictures.values()) + refined + _MESH * len(_with_mesh(capture, meshes))
     done = 0
 
@@ -200,16 +204,18 @@ def evaluate(
             show(done / max(to_do, 1), what)
 
     metrics: dict[str, object] = {}
-    for split in pictures:
-        count = few if split == "train" else most
-        part = measure_split(avatar, capture, split, count, True, lambda f, p, s=split: watch(s))
-        if part or split == "train":
+    for split in ("novel_view", "novel_pose"):
+        part = measure_split(avatar, capture, split, most, True, lambda f, p, s=split: watch(s))
+        if part:
             metrics[split] = part
+    metrics["train"] = trained = measure_split(avatar, capture, "train", few, True, lambda f, p: watch("train"))
     geometry = measure_geometry(avatar, capture, meshes, watch=lambda: watch("geometry", _MESH))
     if geometry:
         metrics["geometry"] = geometry
     if isinstance(getattr(avatar, "refinement", None), PoseRefinement):
-        metrics["pose_refinement"] = measure_refinement(avatar, capture, few, lambda f, p: watch("pose refinement"))
+        metrics["pose_refinement"] = measure_refinement(
+            avatar, capture, few, trained, lambda f, p: watch("pose refinement")
+        )
     metrics |= extra or {}
     write_json(folder / "metrics.json", metrics)
     return metrics
