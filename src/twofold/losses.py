@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -9,12 +10,49 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from twofold.config import require_within
+
 S3IM_REPEATS = 10
 """Orders in which the rays are laid out in the virtual picture: as given, then permuted at random."""
 S3IM_WINDOW = 4
 """Pixels across the window of `s3im`, and between two windows."""
 S3IM_SIGMA = 1.5
 """Standard deviation of that window, pixels."""
+MOST_STEPS = 10**12
+"""No training takes so many; a step of it means never."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss terms; a weight of zero leaves the term out."""
+
+    reconstruction: float = 1.0
+    eikonal: float = 0.1
+    common: float = 0.5
+    lpips: float = 1.0
+    lpips_start: int = 20_000
+    """First step with the perceptual term."""
+    mask: float = 0.1
+    mask_form: Literal["sides", "mean"] = "sides"
+    """"sides": inside and outside rays averaged apart, as released; "mean": plain mean."""
+    s3im: float = 0.1
+    eikonal_points: int = 512
+    """Random canonical body vertices, each moved by a normal deviate."""
+    eikonal_spread: float = 0.01
+    """Standard deviation of that, metres."""
+    reduction: Literal["mean", "sum"] = "mean"
+    """Whether colour differences are averaged over rays and channels, as released, or summed, as printed."""
+
+    def __post_init__(self) -> None:
+        """Refuses weights that reward what they should punish."""
+        weights = (self.eikonal, self.common, self.lpips, self.mask, self.s3im)
+        right = min(weights) >= 0 < self.reconstruction
+        if not right:
+            raise ValueError("weights should not be negative, reconstruction positive")
+        require_within(
+            self, reconstruction=(0, 1e6), eikonal=(0, 1e6), common=(0, 1e6), lpips=(0, 1e6), mask=(0, 1e6),
+            s3im=(0, 1e6), lpips_start=(0, MOST_STEPS), eikonal_points=(1, 1_000_000), eikonal_spread=(0, 1),
+        )  # fmt: skip
 
 
 def reconstruction(

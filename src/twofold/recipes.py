@@ -7,7 +7,8 @@ from dataclasses import replace
 from twofold.capture.pixels import PixelConfig
 from twofold.field.factorized import FactorizedFieldConfig
 from twofold.field.factorized_grid import GridFieldConfig
-from twofold.methods.factorized import FactorizedConfig, LossConfig, PoseConfig
+from twofold.losses import LossConfig
+from twofold.methods.factorized import FactorizedConfig, PoseConfig
 from twofold.methods.placing import ShellSampler
 from twofold.train.run import Recipe, TrainingConfig
 from twofold.volume.samplers import ErrorBoundedSampler

@@ -208,3 +208,32 @@ def test_turning_camera_and_body_together_changes_next_to_nothing(subject, perso
     avatar = opaque(CASES["quick"].method.build(subject, 0))
     change = change_by_moving(avatar, person, camera, torch.tensor([0.3, -0.8, 0.5]), torch.tensor([0.5, -1.0, 0.25]))
     assert change.mean() < 1e-3
+
+
+def test_query_agrees_with_level_and_gives_colours(avatar, posed):
+    x = posed.body.canonical_vertices[::9] + 0.004
+    with torch.no_grad():
+        for branch in ("full", "base"):
+            answer = avatar.query(x, posed, branch=branch)
+            assert torch.allclose(answer.sdf, avatar.level(x, posed, branch), atol=1e-6)
+            assert answer.color.shape == x.shape
+            assert answer.color.isfinite().all()
+
+
+def test_light_is_left_out_only_where_the_method_separates_it(avatar, posed):
+    x = posed.body.canonical_vertices[::9]
+    with torch.no_grad():
+        if avatar.separates_light:
+            avatar.field.light.weight.fill_(0.1)
+        lit, unlit = avatar.query(x, posed), avatar.query(x, posed, lit=False)
+        if avatar.separates_light:
+            avatar.field.light.weight.zero_()
+            assert torch.allclose(unlit.color, avatar.query(x, posed).color, atol=1e-6)
+    assert torch.allclose(lit.color, unlit.color) != avatar.separates_light
+    assert torch.allclose(lit.sdf, unlit.sdf, atol=1e-6)
+
+
+def test_points_on_the_posed_body_map_to_its_canonical_surface(avatar, posed):
+    x, matrix = avatar.to_canonical(posed.body.vertices[::9], posed)
+    assert matrix.shape == (len(x), 3, 3)
+    assert (x - posed.body.canonical_vertices[::9]).norm(dim=-1).median() < 0.02

@@ -4,7 +4,7 @@ The low branch sees only coarse grid levels and the body; the high branch sees f
 branch's features. Distances, colours, gates and losses are those of the network form in `factorized`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -236,11 +236,26 @@ class GridField(nn.Module):
         """
         # Normals enter the colours as constants: the shape learns from densities, at half the cost.
         g = self._geometry(x, pose, "constant")
+        base, plain = self._unlit_colors(x, g)
+        below = None if base is None else FieldOutput(g.s1, base * self._light(g.g1, to_observation), g.g1)
+        return self._output(FieldOutput(g.s, plain * self._light(g.g, to_observation), g.g), below)
+
+    def unlit(self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> FieldOutput:
+        """What `forward` gives without its law of light: the surface's own colour, up to one factor; no gradients."""
+        g = self._geometry(x, pose, "none")
+        base, plain = self._unlit_colors(x, g)
+        return self._output(FieldOutput(g.s, plain, None), None if base is None else FieldOutput(g.s1, base, None))
+
+    def _output(self, whole: FieldOutput, base: FieldOutput | None) -> FieldOutput:
+        return replace(whole, base=base) if self.config.branches in ("both", "high_rendered") else whole
+
+    def _unlit_colors(self, x: Tensor, g: _Geometry) -> tuple[Tensor | None, Tensor]:
+        """Colours of the base branch, where there is one, and of the whole."""
         base, plain, feature = None, torch.zeros_like(x), None
         if self.has_low:
             answer, _ = self.low_color(torch.cat([g.low, g.f1], -1), g.code)
-            plain, feature = torch.sigmoid(answer[:, :3]), answer[:, 3:]
-            base = FieldOutput(g.s1, plain * self._light(g.g1, to_observation), g.g1)
+            base, feature = torch.sigmoid(answer[:, :3]), answer[:, 3:]
+            plain = base
         if self.has_high:
             parts = [g.high, g.f2]
             if self.handed and feature is not None:
@@ -248,8 +263,7 @@ class GridField(nn.Module):
             residual, _ = self.high_color(torch.cat(parts, -1), g.code)
             alone = base is None or self.config.branches == "high_rendered"
             plain = torch.sigmoid(residual) if alone else plain + g.gate[:, None] * residual
-        color = plain * self._light(g.g, to_observation)
-        return FieldOutput(g.s, color, g.g, base if self.config.branches in ("both", "high_rendered") else None)
+        return base, plain
 
     def _light(self, gradient: Tensor, to_observation: Tensor | None) -> Tensor:
         """Brightness for a normal, the same law for all points of the body.

@@ -14,6 +14,7 @@ from twofold.capture.pixels import Batch
 from twofold.capture.types import Capture
 from twofold.deform.shell import Shell
 from twofold.errors import TwofoldError
+from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
 
 
@@ -155,6 +156,44 @@ class Avatar(nn.Module, ABC):
     @abstractmethod
     def level(self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full") -> Float[Tensor, "S"]:
         """Zero on the surface in canonical space, negative inside; of the "full" field or its "base" branch."""
+
+    @property
+    def separates_light(self) -> bool:
+        """Whether `query` can leave the lighting out of the colours."""
+        return False
+
+    def query(
+        self,
+        x_canonical: Float[Tensor, "S 3"],
+        posed: PosedAvatar,
+        to_observation: Float[Tensor, "S 3 3"] | None = None,
+        branch: str = "full",
+        lit: bool = True,
+    ) -> FieldOutput:
+        """The field at points of canonical space: signed distance, colour, canonical gradient.
+
+        Args:
+            x_canonical: points, metres.
+            posed: the pose that the field is conditioned on.
+            to_observation: turns canonical gradients into those of observation space (`to_canonical`), for colours
+                that depend on normals; None leaves normals canonical.
+            branch: "full" or "base".
+            lit: False leaves the lighting out, where `separates_light`; the gradient may then be None.
+
+        Raises:
+            TwofoldError: the method has no such field.
+        """
+        raise TwofoldError(f"{type(self).__name__} has no field that can be queried on a surface; render it instead.")
+
+    def to_canonical(
+        self, x_posed: Float[Tensor, "S 3"], posed: PosedAvatar
+    ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 3"]]:
+        """Points of observation space in canonical space, as `render` maps its samples; and J^-T of the skinning.
+
+        Raises:
+            TwofoldError: the method has no such map.
+        """
+        raise TwofoldError(f"{type(self).__name__} does not map points to canonical space; render it instead.")
 
     @abstractmethod
     def before_step(self, step: int) -> None:

@@ -29,6 +29,8 @@ from twofold.field.factorized_grid import GridField, GridFieldConfig
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
 from twofold.geometry.samples import Samples
+from twofold.geometry.surfaces import nearest_vertices
+from twofold.losses import MOST_STEPS, LossConfig
 from twofold.methods.base import Avatar, PosedAvatar, Rendering, Subject
 from twofold.methods.placing import (
     Distance,
@@ -42,41 +44,6 @@ from twofold.metrics.perceptual import LPIPS
 from twofold.speed import compiled_methods
 from twofold.volume.rendering import composite, composite_weights, laplace_density
 from twofold.volume.samplers import ErrorBoundedSampler
-
-MOST_STEPS = 10**12
-"""No training takes so many; a step of it means never."""
-
-
-@dataclass(frozen=True)
-class LossConfig:
-    """Weights of the loss terms; a weight of zero leaves the term out."""
-
-    reconstruction: float = 1.0
-    eikonal: float = 0.1
-    common: float = 0.5
-    lpips: float = 1.0
-    lpips_start: int = 20_000
-    """First step with the perceptual term."""
-    mask: float = 0.1
-    mask_form: Literal["sides", "mean"] = "sides"
-    """"sides": inside and outside rays averaged apart, as released; "mean": plain mean."""
-    s3im: float = 0.1
-    eikonal_points: int = 512
-    """Random canonical body vertices, each moved by a normal deviate."""
-    eikonal_spread: float = 0.01
-    """Standard deviation of that, metres."""
-    reduction: Literal["mean", "sum"] = "mean"
-    """Whether colour differences are averaged over rays and channels, as released, or summed, as printed."""
-
-    def __post_init__(self) -> None:
-        """Refuses weights that reward what they should punish."""
-        weights = (self.eikonal, self.common, self.lpips, self.mask, self.s3im)
-        right = min(weights) >= 0 < self.reconstruction
-        _require(right, "weights should not be negative, reconstruction positive")
-        require_within(
-            self, reconstruction=(0, 1e6), eikonal=(0, 1e6), common=(0, 1e6), lpips=(0, 1e6), mask=(0, 1e6),
-            s3im=(0, 1e6), lpips_start=(0, MOST_STEPS), eikonal_points=(1, 1_000_000), eikonal_spread=(0, 1),
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -314,7 +281,7 @@ class FactorizedAvatar(Avatar):
         def distance(x_canonical: Tensor) -> Tensor:
             return self.field.sdf(x_canonical, posed.condition)
 
-        weigh = neighbour_weights if self.config.falloff == "exponential" else smooth_neighbour_weights
+        weigh = self._weigh
         if isinstance(sampler, ErrorBoundedSampler):
             placed = place_error_bounded(sampler, rays, posed, k, weigh, limit, generator, distance, self.beta)
             shading = self.config.outliers_in_shading and generator is None
@@ -323,6 +290,10 @@ class FactorizedAvatar(Avatar):
         home = self._canonical_shell(sampler, posed) if sampler.stray > 0 else None
         table = None if self.training or generator is not None else lambda count: self._table(count, posed, distance)
         return that_count(sampler, placed, rays, posed, home, distance, self.beta, table)
+
+    def _weigh(self, squared_distances: Float[Tensor, "S K"]) -> Float[Tensor, "S K"]:
+        exponential = self.config.falloff == "exponential"
+        return (neighbour_weights if exponential else smooth_neighbour_weights)(squared_distances)
 
     def _canonical_shell(self, sampler: ShellSampler, posed: PosedAvatar) -> Shell:
         if self._home is None or self._home.vertices.device != self.device:
@@ -376,12 +347,33 @@ class FactorizedAvatar(Avatar):
 
     def level(self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full") -> Float[Tensor, "S"]:
         """See `Avatar.level`."""
-        if branch not in ("full", "base"):
-            raise ValueError(f'branch is "full" or "base"; it is {branch!r}')
-        if branch == "base":
-            answer = self.field(x_canonical, posed.condition, None)
-            return (answer.base or answer).sdf
-        return self.field.sdf(x_canonical, posed.condition)
+        if branch == "full":
+            return self.field.sdf(x_canonical, posed.condition)
+        return self.query(x_canonical, posed, branch=branch).sdf
+
+    @property
+    def separates_light(self) -> bool:
+        """See `Avatar.separates_light`."""
+        return isinstance(self.field, GridField)
+
+    def query(
+        self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar,
+        to_observation: Float[Tensor, "S 3 3"] | None = None, branch: str = "full", lit: bool = True,
+    ) -> FieldOutput:  # fmt: skip
+        """See `Avatar.query`."""
+        _require(branch in ("full", "base"), f'branch is "full" or "base"; it is {branch!r}')
+        if isinstance(self.field, GridField) and not lit:
+            answer = self.field.unlit(x_canonical, posed.condition)
+        else:
+            answer = self.field(x_canonical, posed.condition, to_observation)
+        return answer if branch == "full" else answer.base or answer
+
+    def to_canonical(
+        self, x_posed: Float[Tensor, "S 3"], posed: PosedAvatar
+    ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 3"]]:
+        """See `Avatar.to_canonical`; the nearest vertices are exact, `render` takes them from the shell's lists."""
+        distances, nearest = nearest_vertices(x_posed, posed.body.vertices, self.config.neighbours)
+        return to_canonical(x_posed, nearest, self._weigh(distances.square()), posed.forward)
 
 
 def _require(holds: bool, wanted: str) -> None:
