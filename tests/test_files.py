@@ -14,17 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twofold.errors import TwofoldError
-from twofold.files import (
-    json_text,
-    new_folder,
-    plain_errors,
-    read_json,
-    read_npz,
-    write_atomically,
-    write_bytes,
-    write_json,
-    write_npz,
-)
+from twofold.files import json_text, new_folder, plain_errors, write_atomically, write_bytes, write_json, write_npz
+from twofold.inputs import read_json
+from twofold.npz import read_npz
 
 posix_only = pytest.mark.skipif(os.name == "nt", reason="needs POSIX limits and users")
 

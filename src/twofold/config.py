@@ -11,8 +11,8 @@ import difflib
 import functools
 import inspect
 import itertools
-import math
 import re
+import sys
 import textwrap
 import types
 from collections.abc import Iterator, Sequence
@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from twofold.errors import TwofoldError
+from twofold.inputs import shown
 
 T = TypeVar("T")
+MOST_FLOAT = sys.float_info.max
 KIND = "kind"
 MOST_SEED = 2**32 - 1
 """Seeds are 0 to this: what every generator takes, and a sine of it still tells neighbours apart."""
@@ -143,7 +145,7 @@ def _read(annotation: object, data: object, path: str, where: str) -> object:
     for choice in _choices(annotation):
         if _fits(choice, data):
             return _converted(choice, data, path, where)
-    raise TwofoldError(f"{path or 'The content'} in {where} should be {_allowed(annotation)}; it is {data!r}.")
+    raise TwofoldError(f"{path or 'The content'} in {where} should be {_allowed(annotation)}; it is {shown(data)}.")
 
 
 def _read_config(classes: list[type], data: dict[str, object], path: str, where: str) -> object:
@@ -151,12 +153,12 @@ def _read_config(classes: list[type], data: dict[str, object], path: str, where:
     cls = classes[0]
     if len(classes) > 1:
         kind = data.get(KIND)
-        if kind not in names:
-            problem = f"lacks {KIND!r}" if kind is None else f"has the unknown kind {kind!r}"
+        if not isinstance(kind, str) or kind not in names:
+            problem = f"lacks {KIND!r}" if kind is None else f"has the unknown kind {shown(kind)}"
             raise TwofoldError(
                 f"{path} in {where} {problem}; it may be {_either(names)}.{_suggestion(str(kind), names)}"
             )
-        cls = names[str(kind)]
+        cls = names[kind]
         data = {key: value for key, value in data.items() if key != KIND}
     known = [f.name for f in _fields(cls)]
     prefix = f"{path}." if path else ""
@@ -180,7 +182,7 @@ def _fits(choice: object, data: object) -> bool:
     if choice is types.NoneType:
         return data is None
     if choice is float:
-        return isinstance(data, int | float) and not isinstance(data, bool) and math.isfinite(data)
+        return isinstance(data, int | float) and not isinstance(data, bool) and -MOST_FLOAT <= data <= MOST_FLOAT
     if choice is int:
         return isinstance(data, int) and not isinstance(data, bool)
     if choice is bool:

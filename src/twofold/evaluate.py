@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from twofold.capture.types import Capture, Frame, spread
+from twofold.capture.validate import read_mesh
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.files import write_json
 from twofold.methods.base import Avatar, PosedAvatar
@@ -129,11 +130,7 @@ def measure_geometry(
         posed = avatar.pose(frame.pose, frame.translation, None)
         surface, faces = extract_surface(functools.partial(_level, avatar, posed), posed.body.canonical_vertices, voxel)
         vertices = pose_surface(surface, posed.body)
-        with np.load(capture.meshes[time]) as mesh:
-            true_vertices, true_faces = torch.as_tensor(mesh["vertices"]), torch.as_tensor(mesh["faces"])
-        rows.append(
-            shape_metrics.compare_surfaces(vertices.cpu(), faces.cpu(), true_vertices.float(), true_faces.long())
-        )
+        rows.append(shape_metrics.compare_surfaces(vertices.cpu(), faces.cpu(), *read_mesh(capture.meshes[time])))
         if watch:
             watch()
     if not rows:
@@ -188,8 +185,13 @@ def evaluate(
         meshes: at most so many true meshes.
         show: told the share that is done and what is being measured.
         extra: further sections for the file.
+
+    Raises:
+        TwofoldError: a picture or mesh is damaged, or the avatar's numbers are not finite.
     """
     few = min(most or 8, 8)
+    for time in _with_mesh(capture, meshes):
+        read_mesh(capture.meshes[time])  # before hours of work
     pictures = {name: len(spread(capture.splits.get(name, ()), most)) for name in ("novel_view", "novel_pose")}
     pictures["train"] = len(spread(capture.train, few))
     # Training pictures are drawn once more, in the poses as given; held-out ones in both.

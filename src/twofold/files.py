@@ -11,10 +11,8 @@ import json
 import os
 import secrets
 import shutil
-import zipfile
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -165,7 +163,17 @@ def json_text(value: object, indent: int = 0) -> str:
         return "{\n" + ",\n".join(items) + f"\n{outer}}}"
     if isinstance(value, list | tuple) and any(isinstance(v, list | tuple | dict) for v in value):
         return "[\n" + ",\n".join(inner + json_text(v, indent + 2) for v in value) + f"\n{outer}]"
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    # Names of files may hold bytes that are no text (PEP 383); JSON keeps them as escapes.
+    return text if text.isascii() or _is_text(text) else json.dumps(value, allow_nan=False)
+
+
+def _is_text(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def write_npz(path: Path | str, arrays: dict[str, np.ndarray]) -> None:
@@ -181,57 +189,6 @@ def write_npz(path: Path | str, arrays: dict[str, np.ndarray]) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
     write_bytes(path, buffer.getvalue())
-
-
-def read_json(path: Path | str) -> Any:
-    """What a JSON file holds.
-
-    Raises:
-        TwofoldError: it is missing, unreadable or not JSON (the line is named).
-    """
-    path = Path(path)
-    try:
-        return json.loads(path.read_bytes().decode())
-    except json.JSONDecodeError as error:
-        raise TwofoldError(
-            f"{path} is not valid JSON at line {error.lineno} ({error.msg}); correct it there."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise TwofoldError(f"{path} is not text in UTF-8; save it as such.") from error
-    except OSError as error:
-        raise TwofoldError(f"{path} {_why_unreadable(error)}.") from error
-
-
-def read_npz(path: Path | str) -> dict[str, np.ndarray]:
-    """The arrays of an npz file; nothing in it is ever run.
-
-    Raises:
-        TwofoldError: it is missing, unreadable, damaged, or holds Python objects instead of numbers.
-    """
-    path = Path(path)
-    try:
-        with path.open("rb") as file:
-            arrays = np.load(file, allow_pickle=False)
-            if isinstance(arrays, np.ndarray):
-                raise TwofoldError(f"{path} holds a single array, expected several named ones (np.savez).")
-            return {name: arrays[name] for name in arrays.files}
-    except OSError as error:
-        raise TwofoldError(f"{path} {_why_unreadable(error)}.") from error
-    except (ValueError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError) as error:
-        objects = "Object arrays" in str(error)
-        what = "holds Python objects, expected plain arrays" if objects else "is damaged or no npz file"
-        raise TwofoldError(f"{path} {what}; make it again.") from error
-
-
-def _why_unreadable(error: OSError) -> str:
-    """The end of a sentence that begins with the file's name."""
-    if isinstance(error, FileNotFoundError):
-        return "is missing"
-    if isinstance(error, IsADirectoryError):
-        return "is a folder, expected a file"
-    if isinstance(error, PermissionError):
-        return "may not be read; change its permissions"
-    return f"cannot be read ({error.strerror or error})"
 
 
 def _flush_to_disk(path: Path) -> None:

@@ -18,6 +18,7 @@ from numpy import ndarray
 from PIL import Image
 
 from twofold.errors import TwofoldError
+from twofold.images import read_header
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,8 @@ def document(title: str, body: str, style: str = "") -> bytes:
         '<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content="width=device-width">'
         f'<meta name=color-scheme content="light dark"><title>{html.escape(title)}</title><style>{STYLE}{style}</style>'
     )
-    return f"{head}<body>{body}</body></html>\n".encode()
+    # A file's name may hold bytes that are no text.
+    return f"{head}<body>{body}</body></html>\n".encode(errors="replace")
 
 
 def header(title: str, under: str, lead: str = "") -> str:
@@ -117,9 +119,8 @@ def embedded(
         if found is None or not picture.is_file():
             problem = "is missing" if found else f"is no {', '.join(kinds)}"
             raise TwofoldError(f"The report's picture {picture} {problem}.")
-        content, stored = picture.read_bytes(), found
-        with Image.open(picture) as image:
-            size = image.size
+        header = read_header(picture)
+        content, stored, size = picture.read_bytes(), found, (header.width, header.height)
     else:
         buffer, image = io.BytesIO(), Image.fromarray(picture)
         image.save(buffer, kind.upper(), optimize=True)

@@ -221,9 +221,9 @@ def nobody(file):
 @pytest.mark.parametrize(
     ("name", "spoil", "sentence"),
     [
-        ("images/0000.jpg", no_picture, "cannot be read as a picture; save it again"),
-        ("images/0003.jpg", no_picture, "cannot be read as a picture; save it again|no readable picture"),
-        ("masks/0003.png", no_picture, "cannot be read as a picture; save it again|no readable picture"),
+        ("images/0000.jpg", no_picture, "is no image of a known kind"),
+        ("images/0003.jpg", no_picture, "is no image of a known kind"),
+        ("masks/0003.png", no_picture, "is no image of a known kind"),
         ("masks/0003.png", nobody, "is all black, so nobody is there"),
     ],
 )

@@ -33,7 +33,7 @@ def only(faults):
     ("edit", "sentence"),
     [
         (lambda d: d.pop("name"), '"name" should be a text'),
-        (lambda d: d.update(fps=0), '"fps" should be moments per second above 0, it is 0'),
+        (lambda d: d.update(fps=0), '"fps" should be moments per second above 0, up to 100000; it is 0'),
         (lambda d: d.update(fps=None), '"fps" should be'),
         (lambda d: d.update(background=[0, 128, 255]), '"background" should be three numbers from 0 to 1'),
         (lambda d: d.update(credit=7), '"credit" should be a text'),
@@ -155,8 +155,8 @@ def test_a_picture_of_the_wrong_kind_is_named(tiny, kind, mode):
 @pytest.mark.parametrize("kind", ["images", "masks"])
 def test_an_unreadable_picture_is_named_once(tiny, kind):
     (tiny / f"{kind}/front/000001.png").write_bytes(b"no picture at all")
-    assert f"{kind}/front/000001.png is no readable picture (unknown format)" in only(validate(tiny))
-    with pytest.raises(TwofoldError, match="no readable picture"):
+    assert f"{kind}/front/000001.png is no image of a known kind (PNG, JPEG, WEBP, TIFF, BMP)" in only(validate(tiny))
+    with pytest.raises(TwofoldError, match="no image of a known kind"):
         read_capture(tiny)
 
 
@@ -229,7 +229,7 @@ def test_all_faults_come_in_one_go(tiny, describe, move):
     describe(lambda d: d["splits"]["novel_pose"].append({"camera": "top", "times": [4]}))
     expected = [
         "motion.npz: poses", "camera back: the focal", "unknown camera 'top'", '"fps"', '"background"', "times 2;",
-        "000003.png is no readable", "000000.png is all black", "000001.png is all white",
+        "000003.png is no image of", "000000.png is all black", "000001.png is all white",
     ]  # fmt: skip
     faults = validate(tiny)
     assert len(faults) == len(expected)

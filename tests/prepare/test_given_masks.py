@@ -144,7 +144,7 @@ def test_what_cannot_be_used_is_said_in_one_sentence(tmp_path, make, sentence):
 
 @pytest.mark.parametrize(
     ("pixels", "sentence"),
-    [(corners(), "is a coloured picture"), ("two objects", "marks 2 objects"), ("half", "cannot be read as a mask")],
+    [(corners(), "is a coloured picture"), ("two objects", "marks 2 objects"), ("half", "is damaged")],
 )
 def test_pictures_that_are_no_masks_are_named(tmp_path, pixels, sentence):
     path = tmp_path / "3.png"

@@ -40,7 +40,7 @@ FAILURES = [
     (lambda stage: stage.nobody(range(5)), {}, "shows a person in only 64 % of the pictures"),
     (half_bad, {}, "6 of 14 pictures of cam0 could not be understood (moments 2-7); at 2, for one, the body does not"),
     (cut_off, {}, "of cam0 head, hands or feet are beyond the picture's edge"),
-    (damaged, {}, "009.png cannot be read as a picture"),
+    (damaged, {}, "009.png is"),
     (lambda stage: None, {"train_camera": "side"}, "--train-camera side is none of the clips; they are cam0."),
     (lambda stage: None, {"held_out": 1}, "One moment of 1 cannot be held out"),
     (lambda stage: stage.clips.append(stage.clips[0]), {}, "2 videos were given, which need --calibration"),

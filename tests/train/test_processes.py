@@ -28,7 +28,7 @@ from pathlib import Path
 from twofold import cli
 from twofold.capture.folder import read_capture
 from twofold.config import from_dict
-from twofold.files import read_json
+from twofold.inputs import read_json
 from twofold.train import loop
 from twofold.train.run import Recipe
 torch.set_num_threads(1)

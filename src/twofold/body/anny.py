@@ -24,7 +24,8 @@ from jaxtyping import Float, Int
 from twofold.body.retarget import straighten
 from twofold.body.skeleton import JOINT_NAMES, Body
 from twofold.errors import TwofoldError
-from twofold.files import read_npz, write_npz
+from twofold.files import write_npz
+from twofold.npz import read_npz
 
 BONES = (
     "root", "upperleg01.L", "upperleg01.R", "spine04", "lowerleg01.L", "lowerleg01.R", "spine02", "foot.L", "foot.R",

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigid_transform
+from twofold.npz import are_moderate
 
 JOINT_NAMES = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
@@ -61,6 +62,11 @@ class Body:
     joint_basis: Float[Tensor, "24 3 S"]
     pose_basis: Float[Tensor, "V 3 P"]
 
+    @staticmethod
+    def names() -> tuple[str, ...]:
+        """What the arrays of a body are called."""
+        return tuple(f.name for f in fields(Body))
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Every array by its name, as a capture or a run stores it; `from_arrays` reads it back."""
         tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
@@ -74,7 +80,7 @@ class Body:
             TwofoldError: an array is missing, has a wrong shape, or holds something that is no finite number; or see
                 `require_surface`.
         """
-        names = [f.name for f in fields(Body)]
+        names = Body.names()
         missing = [name for name in names if name not in arrays]
         if missing:
             raise TwofoldError(f"{where} lacks {', '.join(missing)}; expected {', '.join(names)}.")
@@ -88,7 +94,7 @@ class Body:
             expected = tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in shape)
             if array.shape != expected:
                 raise TwofoldError(f"{name} in {where} should have the shape {expected}, it has {array.shape}.")
-            if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+            if array.dtype.kind not in "fiu" or not are_moderate(array):
                 raise TwofoldError(f"{name} in {where} holds something that is no finite number; make the body again.")
         if sizes["P"] not in (0, 207):
             raise TwofoldError(f"pose_basis in {where} should have 207 columns or none, it has {sizes['P']}.")

@@ -3,6 +3,7 @@
 What can be read is returned beside one sentence for each fault, so that a user can mend all of them in one go.
 """
 
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable
@@ -18,8 +19,9 @@ from torch import Tensor
 from twofold.body.skeleton import Body, shape_body, size_fault
 from twofold.capture.types import SPLITS
 from twofold.errors import TwofoldError
-from twofold.files import read_json, read_npz
 from twofold.geometry.cameras import Camera
+from twofold.inputs import read_json, shown, shown_path, why_unreadable
+from twofold.npz import are_moderate, read_npz
 
 FORMAT, VERSION = "twofold-capture", 1
 DESCRIPTION, BODY, MOTION = "capture.json", "body.npz", "motion.npz"
@@ -27,8 +29,15 @@ IMAGES, MASKS, IGNORED, MESHES = "images", "masks", "ignored", "meshes"
 CHECK = "check"
 """What `twofold check` found lies here; nothing reads it."""
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg")
-CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 """Camera names are folder names, so nothing that leaves the folder or breaks on another system."""
+MAX_SIDE = 32_768
+"""Rows or columns of a picture."""
+_MAX_FPS = 100_000
+_MAX_FOCAL = 1000
+"""Focal lengths in widths of the picture; telescopes have fewer."""
+_MAX_RUNS = 12
+"""Of numbers, in a sentence."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +86,12 @@ class Contents:
 
 def numbered_files(folder: Path, endings: tuple[str, ...]) -> dict[int, Path]:
     """Files called by a number of at least six digits, by that number; among several endings the first one wins."""
-    if not folder.is_dir():
+    if not os.path.isdir(folder):  # unlike Path.is_dir, it is false for names that are too long
         return {}
-    found = {path.name: path for path in folder.iterdir()}
+    try:
+        found = {path.name: path for path in folder.iterdir()}
+    except OSError as error:
+        raise TwofoldError(f"The folder {folder} {why_unreadable(error)}.") from error
     numbered: dict[int, Path] = {}
     for ending in reversed(endings):
         for name, path in sorted(found.items()):
@@ -99,7 +111,7 @@ def file_stem(time: int) -> str:
 
 
 def spans(times: Iterable[int]) -> str:
-    """Numbers in few words.
+    """Numbers in few words; of very many the first.
 
     >>> spans([4, 0, 1, 2])
     '0-2, 4'
@@ -110,7 +122,9 @@ def spans(times: Iterable[int]) -> str:
             runs[-1][1] = time
         else:
             runs.append([time, time])
-    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in runs)
+    more = sum(b - a + 1 for a, b in runs[_MAX_RUNS:])
+    words = [f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:_MAX_RUNS]]
+    return ", ".join(words) + (f" and {more} more" if more else "")
 
 
 def read_contents(folder: Path) -> tuple[Contents, list[str]]:
@@ -119,19 +133,22 @@ def read_contents(folder: Path) -> tuple[Contents, list[str]]:
     Raises:
         TwofoldError: it is no capture folder at all, so that there is nothing to check.
     """
-    if not folder.is_dir():
-        what = "is a file, expected a capture folder" if folder.exists() else "does not exist"
-        raise TwofoldError(f"{folder} {what}; make a capture with `twofold studio` or correct the path.")
-    if not (folder / DESCRIPTION).exists():
-        what = "lacks capture.json" if any(folder.iterdir()) else "is empty"
+    if not os.path.isdir(folder):
+        what = "is a file, expected a capture folder" if os.path.exists(folder) else "does not exist"
+        raise TwofoldError(f"{shown_path(folder)} {what}; make a capture with `twofold studio` or correct the path.")
+    if not os.path.exists(folder / DESCRIPTION):
+        try:
+            what = "lacks capture.json" if any(folder.iterdir()) else "is empty"
+        except OSError as error:
+            raise TwofoldError(f"The folder {folder} {why_unreadable(error)}.") from error
         raise TwofoldError(f"{folder} {what}, so it is no capture folder; docs/captures.md says what belongs in one.")
     description = read_json(folder / DESCRIPTION)
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise TwofoldError(f'{folder / DESCRIPTION} does not say "format": "{FORMAT}"; it describes something else.')
     if description.get("version") != VERSION:
         raise TwofoldError(
-            f"{folder / DESCRIPTION} has version {description.get('version')!r}, this program reads version {VERSION}; "
-            "install the program it was made with."
+            f"{folder / DESCRIPTION} has version {shown(description.get('version'))}, this program reads version "
+            f"{VERSION}; install the program it was made with."
         )
     faults: list[str] = []
     body = _read_body(folder, faults)
@@ -149,16 +166,17 @@ def read_contents(folder: Path) -> tuple[Contents, list[str]]:
 def _titles(description: dict[str, Any], faults: list[str]) -> tuple[str, float, tuple[float, float, float], str]:
     name, credit = description.get("name"), description.get("credit", "")
     if not isinstance(name, str) or not name:
-        faults.append(f'{DESCRIPTION}: "name" should be a text, it is {name!r}.')
+        faults.append(f'{DESCRIPTION}: "name" should be a text, it is {shown(name)}.')
     if not isinstance(credit, str):
-        faults.append(f'{DESCRIPTION}: "credit" should be a text (empty for your own pictures), it is {credit!r}.')
+        faults.append(f'{DESCRIPTION}: "credit" should be a text (empty for your own pictures), it is {shown(credit)}.')
     fps = _numbers(description.get("fps"), ())
-    if fps is None or fps <= 0:
-        faults.append(f'{DESCRIPTION}: "fps" should be moments per second above 0, it is {description.get("fps")!r}.')
+    if fps is None or not 1e-6 <= fps <= _MAX_FPS:
+        given = shown(description.get("fps"))
+        faults.append(f'{DESCRIPTION}: "fps" should be moments per second above 0, up to {_MAX_FPS}; it is {given}.')
     background = _numbers(description.get("background"), (3,))
     if background is None or background.min() < 0 or background.max() > 1:
-        given = description.get("background")
-        faults.append(f'{DESCRIPTION}: "background" should be three numbers from 0 to 1, it is {given!r}.')
+        given = shown(description.get("background"))
+        faults.append(f'{DESCRIPTION}: "background" should be three numbers from 0 to 1, it is {given}.')
         background = np.zeros(3)
     red, green, blue = background.tolist()
     return str(name), 1.0 if fps is None else float(fps), (red, green, blue), str(credit)
@@ -170,17 +188,17 @@ def _cameras(given: Any, faults: list[str]) -> dict[str, Camera]:
         return {}
     cameras: dict[str, Camera] = {}
     for name, entry in given.items():
-        where = f"{DESCRIPTION}: camera {name}"
+        where = f"{DESCRIPTION}: camera {shown_path(name, 120)}"
         found = len(faults)
         if not CAMERA_NAME.fullmatch(name):
-            faults.append(f"{where}: a camera's name is a folder's name; use letters, digits, '_', '-' and '.'.")
+            faults.append(f"{where}: a camera's name is a folder's name; use 1 to 100 letters, digits, _, - and dots.")
         if not isinstance(entry, dict):
             faults.append(f"{where} should hold world_to_camera, intrinsics, height and width.")
             continue
         height, width = (_count(entry.get(side)) for side in ("height", "width"))
         if not height or not width:
-            given_size = f"{entry.get('height')!r} and {entry.get('width')!r}"
-            faults.append(f"{where}: height and width should be whole pixels above 0, they are {given_size}.")
+            given_size = f"{shown(entry.get('height'))} and {shown(entry.get('width'))}"
+            faults.append(f"{where}: height and width should be whole pixels, 1 to {MAX_SIDE}; they are {given_size}.")
         world_to_camera = _numbers(entry.get("world_to_camera"), (4, 4))
         intrinsics = _numbers(entry.get("intrinsics"), (3, 3))
         faults += [f"{where}: {fault}" for fault in rigid_faults(world_to_camera)]
@@ -212,10 +230,15 @@ def intrinsics_faults(matrix: np.ndarray | None, width: int) -> list[str]:
         return ["intrinsics should be 3 rows of 3 finite numbers."]
     faults: list[str] = []
     focal = matrix[0, 0], matrix[1, 1]
+    farthest = _MAX_FOCAL * (width if width > 0 else MAX_SIDE)
     if min(focal) <= 0:
         faults.append(f"the focal lengths should be above 0, they are {focal[0]:g} and {focal[1]:g}.")
     elif min(focal) < 0.05 * width:
         faults.append(f"the focal length {min(focal):g} is far too short for {width} columns; give it in pixels.")
+    elif max(focal) > farthest:
+        faults.append(f"the focal length {max(focal):g} is longer than any lens has; give it in pixels.")
+    if np.abs(matrix[:2, 2]).max() > farthest:
+        faults.append("the principal point is far outside the picture; give it in pixels.")
     if np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6 or abs(matrix[1, 0]) > 1e-6:
         faults.append("intrinsics should read [fx s cx; 0 fy cy; 0 0 1]; perhaps the matrix is transposed.")
     return faults
@@ -228,7 +251,7 @@ def _splits(
         faults.append(f'{DESCRIPTION}: "splits" should name the pictures of {", ".join(SPLITS)}.')
         return dict.fromkeys(SPLITS, ())
     for name in set(given) - set(SPLITS):
-        faults.append(f"{DESCRIPTION}: there is no split {name!r}; the splits are {', '.join(SPLITS)}.")
+        faults.append(f"{DESCRIPTION}: there is no split {shown(name)}; the splits are {', '.join(SPLITS)}.")
     splits = {"train": _split("train", given.get("train", []), cameras, moments, faults)}
     damaged = any(" split train" in fault for fault in faults)
     splits |= {split: _split(split, given.get(split, []), cameras, moments, faults) for split in SPLITS[1:]}
@@ -264,13 +287,16 @@ def _split(
             faults.append(f'{where} should be a list of {{"camera": name, "times": [numbers]}}.')
             continue
         camera, times = entry.get("camera"), entry["times"]
-        if camera not in cameras:
-            faults.append(f"{where} names the unknown camera {camera!r}; known are {', '.join(sorted(cameras))}.")
+        if not isinstance(camera, str) or camera not in cameras:
+            known = shown_path(", ".join(sorted(cameras)))
+            faults.append(f"{where} names the unknown camera {shown(camera)}; known are {known}.")
             continue
+        if not CAMERA_NAME.fullmatch(camera):
+            continue  # a fault of the camera
         if not all(type(time) is int and time >= 0 for time in times):
             faults.append(f"{where}: the times of camera {camera} should be whole numbers from 0 up.")
             continue
-        beyond = [time for time in times if moments is not None and time >= moments]
+        beyond = {time for time in times if moments is not None and time >= moments}
         if beyond:
             faults.append(
                 f"{where}: camera {camera} shows times {spans(beyond)}, {MOTION} ends at {(moments or 0) - 1}."
@@ -284,19 +310,20 @@ def _split(
 
 def _read_body(folder: Path, faults: list[str]) -> Body | None:
     try:
-        return Body.from_arrays(read_npz(folder / BODY), BODY)
+        return Body.from_arrays(read_npz(folder / BODY, Body.names()), BODY)
     except TwofoldError as error:
-        faults.append(_within(folder, error))
+        faults.append(within_folder(folder, error))
         return None
 
 
 def _read_motion(
     folder: Path, body: Body | None, faults: list[str]
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    names = ("betas", "poses", "translations", "true_poses", "true_translations")
     try:
-        arrays = read_npz(folder / MOTION)
+        arrays = read_npz(folder / MOTION, names)
     except TwofoldError as error:
-        faults.append(_within(folder, error))
+        faults.append(within_folder(folder, error))
         return None, None, None
     moments = len(arrays["poses"]) if "poses" in arrays and arrays["poses"].ndim else 0
     shapes: dict[str, tuple[int | None, ...]] = {
@@ -316,6 +343,8 @@ def _read_motion(
             bad = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(1)).tolist()
             where = "elements" if name == "betas" else "times"
             faults.append(f"{MOTION}: {name} is not finite at {where} {spans(bad)}; estimate or leave these out.")
+        elif not are_moderate(array):
+            faults.append(f"{MOTION}: {name} holds numbers beyond a thousand million; give metres and radians.")
         elif name.endswith("poses") and (turns := np.linalg.norm(array, axis=-1)).size and turns.max() > 4 * np.pi:
             bad = np.flatnonzero((turns > 4 * np.pi).any(-1)).tolist()
             faults.append(f"{MOTION}: {name} turns joints by more than two turns at times {spans(bad)}; give radians.")
@@ -336,8 +365,8 @@ def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
 
 
 def _count(value: Any) -> int:
-    """`value` if it is a whole number above 0, else 0."""
-    return value if type(value) is int and value > 0 else 0
+    """`value` if it is a number of rows or columns, else 0."""
+    return value if type(value) is int and 0 < value <= MAX_SIDE else 0
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray | None:
@@ -346,11 +375,11 @@ def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray | None:
         array = np.asarray(value)
     except ValueError:  # rows of unequal length
         return None
-    if array.dtype.kind not in "fiu" or array.shape != shape or not np.isfinite(array).all():
+    if array.dtype.kind not in "fiu" or array.shape != shape or not are_moderate(array):
         return None
     return array.astype(np.float64)
 
 
-def _within(folder: Path, error: TwofoldError) -> str:
+def within_folder(folder: Path, error: TwofoldError) -> str:
     """Its sentence, with paths as seen from the capture folder, as all other faults have them."""
     return str(error).replace(f"{folder}/", "")

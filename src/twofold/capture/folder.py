@@ -35,8 +35,10 @@ from twofold.capture.contents import (
 from twofold.capture.types import SPLITS, Capture, Frame
 from twofold.capture.validate import pixel_faults, quick_faults, require
 from twofold.errors import TwofoldError
-from twofold.files import new_folder, plain_errors, read_npz, write_json, write_npz
+from twofold.files import new_folder, plain_errors, write_json, write_npz
 from twofold.geometry.cameras import Camera
+from twofold.inputs import require_file
+from twofold.npz import read_npz
 
 
 def read_capture(folder: Path | str) -> Capture:
@@ -88,7 +90,7 @@ def read_true_motion(folder: Path | str) -> tuple[Float[Tensor, "T 24 3"], Float
     Raises:
         TwofoldError: `motion.npz` cannot be read.
     """
-    arrays = read_npz(Path(folder) / MOTION)
+    arrays = read_npz(Path(folder) / MOTION, ("true_poses", "true_translations"))
     if "true_poses" not in arrays or "true_translations" not in arrays:
         return None
     poses, translations = (torch.as_tensor(arrays[f"true_{n}"].astype(np.float32)) for n in ("poses", "translations"))
@@ -261,6 +263,7 @@ class CaptureWriter:
         ending = source.suffix.lower()
         if ending not in PICTURE_ENDINGS:
             raise TwofoldError(f"{source} should be one of {', '.join(PICTURE_ENDINGS)}; save it as PNG.")
+        require_file(source)  # a device would be copied without end
         self._put(f"{kind}/{camera}/{file_stem(time)}{ending}", source)
 
     def _put(self, name: str, content: bytes | Path) -> None:

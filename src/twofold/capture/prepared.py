@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image
 from torch import Tensor
 
 from twofold.body.retarget import convert_pose, straighten
@@ -23,12 +22,17 @@ from twofold.capture.contents import IMAGES, MASKS, file_stem, spans
 from twofold.capture.folder import CaptureWriter
 from twofold.capture.masks import SeenBody, see_body, usual_colors, without_objects
 from twofold.errors import TwofoldError
-from twofold.files import read_npz
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from twofold.images import read_grey, read_rgb
+from twofold.npz import are_moderate, read_npz
 
 CAMERA = "cam"
 ARRAYS = "capture.npz"
+_ARRAYS = (
+    "intrinsics", "world_to_camera", "poses", "transl", "rest_vertices", "rest_joints", "parents", "weights", "faces",
+    "silhouette_iou", "video_frame",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -198,11 +202,7 @@ def _pixels(file: Path, mode: Literal["L", "RGB"]) -> UInt8[np.ndarray, "h w *c"
     Raises:
         TwofoldError: it cannot be decoded.
     """
-    try:
-        with Image.open(file) as picture:
-            return np.asarray(picture.convert(mode))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise TwofoldError(f"{file} cannot be read as a picture; save it again.") from error
+    return read_grey(file) if mode == "L" else read_rgb(file)
 
 
 def turn_world(
@@ -235,7 +235,7 @@ def _read_arrays(source: Path) -> dict[str, np.ndarray]:
     if not source.is_dir():
         raise TwofoldError(f"{source} is no folder; expected a prepared one with images, masks and {ARRAYS}.")
     where = source / ARRAYS
-    arrays = read_npz(where)
+    arrays = read_npz(where, _ARRAYS)
     frames, vertices = (len(arrays[n]) if n in arrays and arrays[n].ndim else 0 for n in ("poses", "rest_vertices"))
     arrays.setdefault("silhouette_iou", np.ones(frames))
     arrays.setdefault("video_frame", np.arange(frames))
@@ -251,7 +251,7 @@ def _read_arrays(source: Path) -> dict[str, np.ndarray]:
         if arrays[name].shape != shape or arrays[name].dtype.kind not in "fiu":
             found = f"{arrays[name].dtype} of {arrays[name].shape}"
             raise TwofoldError(f"{name} in {where} should be numbers of shape {shape}, it is {found}.")
-        if not np.isfinite(arrays[name]).all():
+        if not are_moderate(arrays[name]):
             raise TwofoldError(f"{name} in {where} holds a number that is not finite; prepare the capture again.")
     if tuple(arrays["parents"].tolist()) != PARENTS:
         raise TwofoldError(f"The joints in {where} do not hang together as SMPL's 24 do; bring them to that order.")

@@ -8,11 +8,11 @@ from typing import TypeVar
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from PIL import Image
 from torch import Tensor
 
 from twofold.body.skeleton import Body
 from twofold.geometry.cameras import Camera
+from twofold.images import read_grey, read_rgb
 
 Item = TypeVar("Item")
 
@@ -23,6 +23,8 @@ SPLITS = ("train", "novel_view", "novel_pose")
 @dataclass(frozen=True)
 class Frame:
     """One picture: a camera at a moment. Pictures are read when asked for, so a long capture costs no memory.
+
+    One that is damaged or gone is a `TwofoldError` then.
 
     Attributes:
         time: index of the moment into the capture's motion.
@@ -46,20 +48,17 @@ class Frame:
 
     def image(self) -> Float[Tensor, "h w 3"]:
         """Colours in 0..1, as stored (background included)."""
-        with Image.open(self.image_file) as picture:
-            return torch.from_numpy(np.array(picture.convert("RGB"), dtype=np.float32) / 255)
+        return torch.from_numpy(read_rgb(self.image_file).astype(np.float32) / 255)
 
     def mask(self) -> Float[Tensor, "h w"]:
         """Share of each pixel that the person covers, 0..1."""
-        with Image.open(self.mask_file) as picture:
-            return torch.from_numpy(np.array(picture.convert("L"), dtype=np.float32) / 255)
+        return torch.from_numpy(read_grey(self.mask_file).astype(np.float32) / 255)
 
     def ignored(self) -> Bool[Tensor, "h w"]:
         """Pixels that are neither learned from nor measured, because something passes in front of the person."""
         if self.ignored_file is None:
             return torch.zeros(self.camera.height, self.camera.width, dtype=torch.bool)
-        with Image.open(self.ignored_file) as picture:
-            return torch.from_numpy(np.array(picture.convert("L")) > 127)
+        return torch.from_numpy(read_grey(self.ignored_file) > 127)
 
 
 @dataclass(frozen=True)

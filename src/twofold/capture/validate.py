@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from twofold.body.skeleton import joint_transforms, shape_body
@@ -27,10 +26,12 @@ from twofold.capture.contents import (
     numbered_files,
     read_contents,
     spans,
+    within_folder,
 )
 from twofold.errors import TwofoldError
-from twofold.files import read_npz
 from twofold.geometry.cameras import Camera, project
+from twofold.images import read_grey, read_header, read_rgb, require_checksums
+from twofold.npz import are_moderate, read_npz
 
 Item = TypeVar("Item")
 _IMAGE_MODES, _MASK_MODES = ("RGB", "RGBA", "L"), ("L", "1")
@@ -50,12 +51,12 @@ def validate(folder: Path | str) -> list[str]:
 
     Each fault is one sentence that says where (files as seen from `folder`), what, and what to do.
     """
-    folder = Path(folder)
+    folder, faults = Path(folder), list[str]()
     try:
         contents, faults = read_contents(folder)
-    except TwofoldError as error:
-        return [str(error)]
-    return faults + quick_faults(contents) + pixel_faults(contents) + mesh_faults(folder)
+        return faults + quick_faults(contents) + pixel_faults(contents) + mesh_faults(folder)
+    except TwofoldError as error:  # no capture, or a folder in it that may not be read
+        return [*faults, str(error)]
 
 
 def require(faults: list[str], folder: Path | str, shown: int = 8) -> None:
@@ -97,14 +98,16 @@ def _header_faults(folder: Path, paths: list[Path], camera: Camera, modes: tuple
     def check(path: Path) -> str:
         where = path.relative_to(folder).as_posix()
         try:
-            with Image.open(path) as picture:
-                (width, height), mode = picture.size, picture.mode
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-            return f"{where} is no readable picture ({_reason(error)}); save it again as PNG."
-        if (height, width) != (camera.height, camera.width):
-            return f"{where} has {width} x {height} pixels, its camera {camera.width} x {camera.height}; resize one."
-        if mode not in modes:
-            return f"{where} should hold {meaning}; it is of the kind {mode}."
+            header = read_header(path)
+        except TwofoldError as error:
+            return within_folder(folder, error)
+        if (header.height, header.width) != (camera.height, camera.width):
+            return (
+                f"{where} has {header.width} x {header.height} pixels, its camera {camera.width} x {camera.height}; "
+                "resize one."
+            )
+        if header.mode not in modes:
+            return f"{where} should hold {meaning}; it is of the kind {header.mode}."
         return ""
 
     return _in_threads(check, paths)
@@ -182,19 +185,25 @@ def _shown_joints(joints: Float[Tensor, "T 24 3"], camera: Camera) -> dict[int, 
     return {time: ShownJoints(pixels[time][inside[time]].numpy(), float(reach[time])) for time in range(len(joints))}
 
 
-def _decoding_fault(folder: Path, path: Path) -> str:
+def _decoded(folder: Path, path: Path, mode: Literal["L", "RGB"]) -> tuple[np.ndarray | None, str]:
+    """A picture's pixels, or None and what is wrong with them; that is empty where a quick check has named it.
+
+    Checksums alone would cost a tenth, but there are pictures whose checksums are right and whose pixels are not there,
+    as there are some whose pixels can be decoded although a few are wrong.
+    """
     try:
-        with Image.open(path) as picture:
-            # PNG carries checksums, which tell as much as decoding and cost a tenth.
-            if picture.format == "PNG":
-                picture.verify()
-            else:
-                picture.load()
-    except UnidentifiedImageError:
-        return ""  # a quick check names it
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        return f"{path.relative_to(folder).as_posix()} is damaged ({_reason(error)}); save it again."
-    return ""
+        read_header(path)
+    except TwofoldError:
+        return None, ""
+    try:
+        require_checksums(path)
+        return (read_rgb if mode == "RGB" else read_grey)(path), ""
+    except TwofoldError as error:
+        return None, within_folder(folder, error)
+
+
+def _decoding_fault(folder: Path, path: Path) -> str:
+    return _decoded(folder, path, "RGB")[1]
 
 
 def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, ShownJoints | None]) -> str:
@@ -206,15 +215,10 @@ def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, ShownJoin
         item: its file, and the joints in the picture, None where they are not known.
     """
     path, joints = item
-    damaged = _decoding_fault(folder, path)
-    if damaged:
+    mask, damaged = _decoded(folder, path, "L")
+    if mask is None:
         return damaged
     where = path.relative_to(folder).as_posix()
-    try:
-        with Image.open(path) as picture:
-            mask = np.array(picture.convert("L"))
-    except UnidentifiedImageError:
-        return ""
     if mask.max() == 0:
         return f"{where} is all black, so nobody is there; mend it or take this time out of the splits."
     if mask.max() < _PERSON:
@@ -240,14 +244,11 @@ def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, ShownJoin
 def _ignored_fault(folder: Path, files: tuple[Path, Path]) -> str:
     """What is wrong with one layer of ignored pixels, given its file and the mask's."""
     ignored_file, mask_file = files
-    damaged = _decoding_fault(folder, ignored_file)
-    if damaged:
+    layer, damaged = _decoded(folder, ignored_file, "L")
+    mask, _ = _decoded(folder, mask_file, "L")
+    if layer is None or mask is None:
         return damaged
-    try:
-        with Image.open(ignored_file) as layer, Image.open(mask_file) as picture:
-            ignored, person = (np.array(p.convert("L")) >= _PERSON for p in (layer, picture))
-    except (OSError, ValueError, SyntaxError):
-        return ""  # other checks name it
+    ignored, person = layer >= _PERSON, mask >= _PERSON
     if ignored.shape == person.shape and person.any() and not (person & ~ignored).any():
         where = ignored_file.relative_to(folder).as_posix()
         return f"{where} ignores all of the person; take this time out of the splits."
@@ -258,20 +259,28 @@ def mesh_faults(folder: Path) -> list[str]:
     """What is wrong with the true surfaces, where there are any."""
     faults: list[str] = []
     for path in numbered_files(folder / MESHES, (".npz",)).values():
-        where = path.relative_to(folder).as_posix()
         try:
-            arrays = read_npz(path)
+            read_mesh(path)
         except TwofoldError as error:
-            faults.append(str(error).replace(f"{folder}/", ""))
-            continue
-        vertices, faces = arrays.get("vertices"), arrays.get("faces")
-        if vertices is None or faces is None or vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-            faults.append(f"{where} should hold vertices (V x 3, metres) and faces (F x 3).")
-        elif not np.isfinite(vertices).all():
-            faults.append(f"{where}: vertices are not finite; make this mesh again.")
-        elif faces.dtype.kind not in "iu" or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
-            faults.append(f"{where}: faces name vertices outside 0..{len(vertices) - 1}; make this mesh again.")
+            faults.append(within_folder(folder, error))
     return faults
+
+
+def read_mesh(path: Path) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
+    """A true surface: vertices in the world, metres, and triangles.
+
+    Raises:
+        TwofoldError: the file is missing or damaged, lacks one of both, or its numbers make no surface.
+    """
+    arrays = read_npz(path, ("vertices", "faces"))
+    vertices, faces = arrays.get("vertices"), arrays.get("faces")
+    if vertices is None or faces is None or vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise TwofoldError(f"{path} should hold vertices (V x 3, metres) and faces (F x 3).")
+    if vertices.dtype.kind not in "fiu" or not are_moderate(vertices):
+        raise TwofoldError(f"{path}: vertices are not finite numbers; make this mesh again.")
+    if faces.dtype.kind not in "iu" or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+        raise TwofoldError(f"{path}: faces name vertices outside 0..{len(vertices) - 1}; make this mesh again.")
+    return torch.as_tensor(vertices.astype(np.float32)), torch.as_tensor(faces.astype(np.int64))
 
 
 def _in_picture(pixels: Float[Tensor, "*b 2"], camera: Camera) -> Tensor:
@@ -281,10 +290,6 @@ def _in_picture(pixels: Float[Tensor, "*b 2"], camera: Camera) -> Tensor:
 
 def _where(times: list[int], chosen: Tensor) -> list[int]:
     return [time for time, yes in zip(times, chosen.tolist(), strict=True) if yes]
-
-
-def _reason(error: BaseException) -> str:
-    return "unknown format" if isinstance(error, UnidentifiedImageError) else str(error).rstrip(".")
 
 
 def _in_threads(check: Callable[[Item], str], items: Iterable[Item]) -> list[str]:

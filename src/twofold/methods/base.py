@@ -16,6 +16,7 @@ from twofold.deform.shell import Shell
 from twofold.errors import TwofoldError
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
+from twofold.npz import are_moderate
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Subject:
         sizes: dict[str | int, int] = {"S": arrays["betas"].size, "T": arrays["times"].size}
         for name, shape in shapes.items():
             array, expected = arrays[name], tuple(sizes.get(axis, axis) for axis in shape)
-            if array.shape != expected or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+            if array.shape != expected or array.dtype.kind not in "fiu" or not are_moderate(array):
                 raise TwofoldError(
                     f"{name} in {where} should be finite numbers of shape {expected}, it is {array.dtype} of "
                     f"{array.shape}; it is damaged, train again."

@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image
 from torch import Tensor
 
 from twofold.body.skeleton import Body
@@ -18,6 +17,7 @@ from twofold.capture.masks import SeenBody, see_body, usual_colors, without_obje
 from twofold.files import plain_errors
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.raster import rasterize
+from twofold.images import read_rgb
 from twofold.prepare.body_points import body_points
 from twofold.prepare.motion import Motion, Posed, choose, place_points, pose_motion
 from twofold.prepare.outlines import open_mask
@@ -144,8 +144,7 @@ def _without_objects(
 
 
 def _open_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    with Image.open(path) as picture:
-        return np.asarray(picture.convert("RGB"))
+    return read_rgb(path)
 
 
 def _usual(

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from twofold.capture.contents import intrinsics_faults, rigid_faults
 from twofold.errors import TwofoldError
-from twofold.files import read_json
+from twofold.inputs import read_json
 from twofold.prepare.calibration import CalibratedCamera
 
 KNOWN = (

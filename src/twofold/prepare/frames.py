@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from twofold.errors import TwofoldError
+from twofold.images import load_image, upright_size
 from twofold.prepare.decoding import Converter, VideoInfo, decode, describe_video
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -18,7 +19,6 @@ USUAL_FPS = 30.0
 """Taken for a folder of pictures, which cannot say it."""
 Item = TypeVar("Item")
 
-_ORIENTATION = 0x0112  # The EXIF field; from 5 on rows and columns are exchanged.
 _FASTER = 1.1  # More pictures than a clip has would come twice; clips state their rate only roughly.
 
 
@@ -213,11 +213,7 @@ def picture_size(path: Path) -> tuple[int, int]:
     Raises:
         TwofoldError: it is no picture.
     """
-    try:
-        with Image.open(path) as image:
-            return image.size[::-1] if image.getexif().get(_ORIENTATION, 1) >= 5 else image.size
-    except (OSError, ValueError, SyntaxError) as error:
-        raise _unreadable(path) from error
+    return upright_size(path)
 
 
 def read_picture(path: Path, info: ClipInfo) -> UInt8[np.ndarray, "h w 3"]:
@@ -226,13 +222,11 @@ def read_picture(path: Path, info: ClipInfo) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         TwofoldError: it cannot be decoded.
     """
-    try:
-        with Image.open(path) as image:
-            if image.mode.startswith("I;16"):  # Pillow would cut off what is brighter than 255.
-                image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
-            upright = ImageOps.exif_transpose(image).convert("RGB")
-    except (OSError, ValueError, SyntaxError) as error:
-        raise _unreadable(path) from error
+    image = load_image(path)
+    upright = ImageOps.exif_transpose(image)
+    if image.mode.startswith("I;16"):  # Pillow would cut off what is brighter than 255.
+        upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
+    upright = upright.convert("RGB")
     if upright.size != (info.width, info.height):
         upright = upright.resize((info.width, info.height), Image.Resampling.BOX)
     return np.asarray(upright)
@@ -281,7 +275,3 @@ def _look_at(
     small = shrunk(video.width, video.height, max_size)
     full = video.width, video.height
     return clip, (), video, ClipInfo(*small, rate, count, count / rate, *full, video.frames, (), video.remarks)
-
-
-def _unreadable(path: Path) -> TwofoldError:
-    return TwofoldError(f"{path} cannot be read as a picture; make it again or take it out.")

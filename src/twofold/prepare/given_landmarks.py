@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from twofold.errors import TwofoldError
-from twofold.files import read_json, read_npz
+from twofold.inputs import read_json, shown
+from twofold.npz import read_npz
 from twofold.prepare.frames import ClipInfo, files_by_picture, files_with, natural_order
 from twofold.prepare.observations import LANDMARKS, Track
 
@@ -32,6 +33,9 @@ LAYOUTS = {
 }
 """What landmarks are called, by how many there are: BlazePose, COCO, OpenPose's older 18 and BODY_25, HALPE_26 and
 COCO-WholeBody; those without a name are not used."""
+_MAX_BYTES = 256 * 2**20
+"""Of a JSON file: 133 landmarks in 30,000 pictures."""
+_MAX_NAME = 255
 NEEDED = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 
 
@@ -59,7 +63,7 @@ def landmarks_from_file(path: Path | str, info: ClipInfo) -> Track:
     elif path.suffix.lower() == ".json":
         values, names = _from_json(path, info)
     else:
-        values, names = _from_arrays(read_npz(path), path)
+        values, names = _from_arrays(read_npz(path, ("landmarks", "names")), path)
     if abs(len(values) - info.sources) > max(1, info.sources // 50):
         raise TwofoldError(
             f"{path} has landmarks of {len(values)} pictures, and the clip has {info.sources}; give them for every one."
@@ -108,7 +112,7 @@ def _from_arrays(arrays: dict[str, Any], path: Path) -> tuple[Float[np.ndarray, 
 
 
 def _from_json(path: Path, info: ClipInfo) -> tuple[Float[np.ndarray, "f k 3"], tuple[str, ...]]:
-    content = read_json(path)
+    content = read_json(path, _MAX_BYTES)
     if isinstance(content, dict):
         return _from_arrays(content, path)
     entries = content if isinstance(content, list) and all(isinstance(e, dict) for e in content) else []
@@ -116,7 +120,10 @@ def _from_json(path: Path, info: ClipInfo) -> tuple[Float[np.ndarray, "f k 3"], 
         raise TwofoldError(f"{path} holds no landmarks in a known form; docs/prepare.md describes those that are read.")
     people: dict[str, list[Any]] = {}
     for entry in entries:
-        people.setdefault(str(entry["image_id"]), []).append(entry["keypoints"])
+        name = str(entry["image_id"])
+        if len(name) > _MAX_NAME:
+            raise TwofoldError(f"{path} names a picture {shown(name)}; write the landmarks anew.")
+        people.setdefault(name, []).append(entry["keypoints"])
     names = {path / name: name for name in sorted(people, key=natural_order)}
     places = files_by_picture(list(names), info, "pictures with landmarks")
     return _assembled({place: people[names[file]] for place, file in places.items()}, info, path)
@@ -173,7 +180,7 @@ def _numbers(value: Any) -> np.ndarray | None:
     """An array of numbers, null as NaN; None if it is none."""
     try:
         return np.array(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
 
 

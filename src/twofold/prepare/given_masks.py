@@ -8,6 +8,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from twofold.errors import TwofoldError
+from twofold.images import load_image
 from twofold.prepare.frames import ClipInfo, files_by_picture, picture_files, picture_size
 
 _OUTSIDE = 127
@@ -82,12 +83,8 @@ def read_mask(path: Path) -> UInt8[np.ndarray, "h w"]:
     Raises:
         TwofoldError: it cannot be decoded, is a coloured picture, or marks several objects.
     """
-    try:
-        with Image.open(path) as image:
-            values = np.asarray(image)
-            mode = image.mode
-    except (OSError, ValueError, SyntaxError) as error:
-        raise TwofoldError(f"{path} cannot be read as a mask; make it again or take it out.") from error
+    image = load_image(path)
+    values, mode = np.asarray(image), image.mode
     if mode in ("LA", "RGBA") and values[..., -1].min() < 255:
         return np.ascontiguousarray(values[..., -1])
     if values.ndim == 3:

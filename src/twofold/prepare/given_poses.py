@@ -10,8 +10,8 @@ from torch import Tensor
 
 from twofold.body.skeleton import Body
 from twofold.errors import TwofoldError
-from twofold.files import read_npz
 from twofold.geometry.rotations import axis_angle_to_matrix
+from twofold.npz import are_moderate, read_npz
 from twofold.prepare.frames import ClipInfo
 from twofold.prepare.motion import Motion
 
@@ -34,7 +34,7 @@ def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], bo
         TwofoldError: the file is missing or damaged, lacks an array, has other shapes, or belongs to another clip.
     """
     path = Path(path)
-    arrays = read_npz(path)
+    arrays = read_npz(path, ("poses", *_PLACES, "betas"))
     poses = _finite(arrays, ("poses",), path)
     places = _finite(arrays, _PLACES, path)
     if poses.ndim < 2 or poses[0].size != 3 * _JOINTS:
@@ -63,7 +63,7 @@ def _finite(arrays: dict[str, np.ndarray], names: Sequence[str], path: Path) -> 
     if not found:
         raise TwofoldError(f"{path} lacks the array `{names[0]}`; docs/prepare.md describes what belongs in it.")
     values = arrays[found[0]]
-    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+    if values.dtype.kind not in "fiu" or not are_moderate(values):
         raise TwofoldError(f"{path}: `{found[0]}` holds something that is no finite number; estimate it again.")
     return values
 

@@ -11,6 +11,8 @@ from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
+from twofold.images import read_grey
+
 GRID = 128
 """Cells along the longer side of a mask's surroundings; a cell is about one percent of a person's height."""
 
@@ -63,11 +65,14 @@ Mask = UInt8[np.ndarray, "h w"] | Path
 
 
 def open_mask(mask: Mask) -> UInt8[np.ndarray, "h w"]:
-    """The mask as an array."""
+    """The mask as an array.
+
+    Raises:
+        TwofoldError: its file is damaged.
+    """
     if not isinstance(mask, Path):
         return mask
-    with Image.open(mask) as picture:
-        return np.asarray(picture.convert("L"))
+    return read_grey(mask)
 
 
 def trace_outlines(masks: Sequence[Mask]) -> Outlines:

@@ -12,11 +12,15 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 
 from twofold.errors import TwofoldError
 from twofold.files import write_atomically
+from twofold.inputs import read_text
 from twofold.train.run import CURVES
 
 # Their classes are made when they are imported, so a type checker does not see them.
 event_pb2: Any = importlib.import_module("tensorboard.compat.proto.event_pb2")
 summary_pb2: Any = importlib.import_module("tensorboard.compat.proto.summary_pb2")
+
+_MAX_BYTES = 256 * 2**20
+"""Of a table; a million rows of ten values have half as many."""
 
 
 class Curves:
@@ -37,10 +41,10 @@ class Curves:
         self.rows: list[dict[str, float]] = []
         if start and self.file.is_file():
             try:
-                with self.file.open(newline="", encoding="utf-8") as lines:
-                    rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(lines)]
+                lines = io.StringIO(read_text(self.file, _MAX_BYTES), newline="")
+                rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(lines)]
                 self.rows = [row for row in rows if row["step"] <= start]
-            except (ValueError, TypeError, KeyError):
+            except (ValueError, TypeError, KeyError, csv.Error):
                 raise TwofoldError(f"{self.file} is damaged; remove it and resume again.") from None
         board = folder / "tensorboard"
         board.mkdir(exist_ok=True)

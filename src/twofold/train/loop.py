@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from twofold import losses
 from twofold.capture.pixels import PixelSource
-from twofold.capture.types import Capture
+from twofold.capture.types import Capture, Frame
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors
 from twofold.methods.base import Avatar, Subject
@@ -26,12 +26,14 @@ from twofold.train.curves import Curves
 from twofold.train.processes import Team, joined
 from twofold.train.run import (
     CHECKPOINT,
+    LOWER_RATES,
     Recipe,
     TrainingConfig,
     load_optimizer,
     load_state,
     read_checkpoint,
     read_subject,
+    require_finite,
     require_free,
     require_same,
     start_folder,
@@ -204,6 +206,10 @@ def train(
                     watch(report)
                 if done % ROW_EVERY == 0 or done == config.steps:
                     curves.add({"step": float(done), **report.losses, "psnr": report.psnr, **_scale(avatar)})
+                if done % ROW_EVERY == 0 or done == config.steps:
+                    require_finite(avatar.state_dict(), folder, done)
+                if done == config.steps:
+                    require_finite({"the surface": _level_on_body(avatar, capture.train[0])}, folder, done)
                 if done % config.checkpoint_every == 0 or done == config.steps or stop:
                     # In this order: the curves are cut back to the checkpoint, not the other way round.
                     curves.save()
@@ -216,6 +222,13 @@ def train(
                 raise KeyboardInterrupt
         team.wait()
     return avatar.eval()
+
+
+@torch.no_grad()
+def _level_on_body(avatar: Avatar, frame: Frame) -> Float[Tensor, "V"]:
+    """The field at the canonical body's vertices, which finite parameters may make infinite all the same."""
+    posed = avatar.pose(frame.pose, frame.translation)
+    return avatar.level(posed.body.canonical_vertices, posed)
 
 
 def _restore(folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer) -> int:
@@ -241,8 +254,8 @@ def _agreed(
     named = dict(zip(terms, found, strict=True))
     if not math.isfinite(sum(found)):
         raise TwofoldError(
-            f"The loss at step {done - 1} is not a finite number; lower the learning rates "
-            "(--set training.rate_low=... and the others) or look at the capture's pictures and poses."
+            f"The loss at step {done - 1} is not a finite number; {LOWER_RATES}, or look at the capture's pictures and "
+            "poses."
         )
     return Progress(done, steps, named, -10 * math.log10(max(error_mean, 1e-10))), stopping > 0
 

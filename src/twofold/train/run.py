@@ -2,8 +2,10 @@
 
 import os
 import platform
+import re
 import shutil
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -20,14 +22,19 @@ from twofold.capture.pixels import PixelConfig
 from twofold.capture.types import Capture
 from twofold.config import MOST_SEED, from_dict, require_within, to_dict
 from twofold.errors import TwofoldError
-from twofold.files import new_folder, plain_errors, read_json, read_npz, write_atomically, write_json, write_npz
+from twofold.files import new_folder, plain_errors, write_atomically, write_json, write_npz
+from twofold.inputs import is_there, read_json, require_file, shown, shown_path
 from twofold.methods.base import Avatar, Subject
 from twofold.methods.factorized import FactorizedConfig
+from twofold.npz import read_npz
 
 RECIPE, ABOUT, SUBJECT, CHECKPOINT, CURVES = (
     "recipe.json", "run.json", "subject.npz", "checkpoint.safetensors", "curves.csv",
 )  # fmt: skip
 """What a run folder holds. The recipe is written last, so a folder that has one has all it takes to begin."""
+LOWER_RATES = "lower the learning rates (--set training.rate_low=... and the others) and train again"
+"""What helps a training whose numbers run away."""
+_DAMAGED = "is damaged; train again"
 
 
 @dataclass(frozen=True)
@@ -169,8 +176,10 @@ def read_recipe(folder: Path) -> Recipe:
         TwofoldError: the folder is no run, or its recipe is damaged.
     """
     file = folder / RECIPE
-    if not file.is_file():
-        raise TwofoldError(f"{folder} is not a run: it has no {RECIPE}; give the folder that `twofold train` made.")
+    if not is_there(file):
+        raise TwofoldError(
+            f"{shown_path(folder)} is not a run: it has no {RECIPE}; give the folder that `twofold train` made."
+        )
     return from_dict(Recipe, read_json(file), str(file))
 
 
@@ -197,8 +206,8 @@ def find_capture(folder: Path, given: Path | None = None, say: str = "--capture"
     stored = read_about(folder).get("capture")
     if not isinstance(stored, str):
         raise TwofoldError(f"{folder / ABOUT} does not name the run's capture; name it with {say}.")
-    if not Path(stored).is_dir():
-        raise TwofoldError(f"The capture of {folder} is no longer at {stored}; say where it is with {say}.")
+    if not is_there(Path(stored)):
+        raise TwofoldError(f"The capture of {folder} is no longer at {shown_path(stored)}; say where it is with {say}.")
     return Path(stored)
 
 
@@ -245,17 +254,33 @@ def load(folder: Path, device: torch.device | str = "cpu") -> tuple[Avatar, int]
     tensors, step = read_checkpoint(folder)
     own = {name[len("avatar.") :]: t for name, t in tensors.items() if name.startswith("avatar.")}
     load_state(avatar, own, folder)
+    broken = not_finite(own)
+    if broken:
+        raise TwofoldError(
+            f"{folder / CHECKPOINT} holds {broken} with numbers that are not finite, so its avatar cannot be used; "
+            f"{LOWER_RATES}."
+        )
     return avatar.to(device).eval(), step
+
+
+def not_finite(tensors: Mapping[str, Tensor]) -> str:
+    """The name of the first of these tensors that holds a number that is not finite; empty where none does."""
+    return next((name for name, t in tensors.items() if t.is_floating_point() and not t.isfinite().all()), "")
 
 
 def load_state(avatar: Avatar, state: dict[str, Tensor], folder: Path) -> None:
     """Puts stored tensors into an avatar; a mismatch is a TwofoldError that names the first one."""
     expected = avatar.state_dict()
-    wrong = [n for n in expected if n not in state or state[n].shape != expected[n].shape]
+    wrong = [n for n, t in expected.items() if n not in state or _kind(state[n]) != _kind(t)]
     if wrong or len(expected) != len(state):
         first = wrong[0] if wrong else next(n for n in state if n not in expected)
         raise TwofoldError(f"The checkpoint in {folder} does not fit its recipe (first at {first}); train again.")
     avatar.load_state_dict(state)
+
+
+def _kind(tensor: Tensor) -> tuple[torch.Size, bool]:
+    """What two tensors have in common of which one can take the other's place."""
+    return tensor.shape, tensor.is_floating_point()
 
 
 def write_checkpoint(folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer, step: int) -> None:
@@ -264,18 +289,26 @@ def write_checkpoint(folder: Path, avatar: Avatar, optimizer: torch.optim.Optimi
     Raises:
         TwofoldError: a parameter is not finite, so the old checkpoint stays; or the disk refuses.
     """
-    broken = [name for name, p in avatar.named_parameters() if not p.isfinite().all()]
-    if broken:
-        raise TwofoldError(
-            f"The training of {folder} diverged: {broken[0]} is not finite at step {step}; lower the learning rates "
-            "(--set training.rate_low=... and the others)."
-        )
     tensors = {f"avatar.{name}": t for name, t in avatar.state_dict().items()}
     for index, values in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{index}.{key}": torch.as_tensor(value) for key, value in values.items()}
+    require_finite(tensors, folder, step)
     whole = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     with write_atomically(folder / CHECKPOINT) as beside:
-        beside.write_bytes(save(whole, metadata={"step": str(step), "twofold": __version__}))
+        about = {"step": str(step), "tensors": str(len(whole)), "twofold": __version__}
+        beside.write_bytes(save(whole, metadata=about))
+
+
+def require_finite(tensors: Mapping[str, Tensor], folder: Path, step: int) -> None:
+    """Ends a training whose numbers have run away.
+
+    Raises:
+        TwofoldError: one of these tensors holds a number that is not finite; it is named.
+    """
+    broken = not_finite(tensors)
+    if broken:
+        name = broken.removeprefix("avatar.")
+        raise TwofoldError(f"The training of {folder} diverged: {name} is not finite at step {step}; {LOWER_RATES}.")
 
 
 def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], int]:
@@ -285,28 +318,46 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], int]:
         TwofoldError: there is none, or it cannot be read.
     """
     file = folder / CHECKPOINT
-    if not file.is_file():
+    if not is_there(file):
         raise TwofoldError(f"{folder} has no checkpoint yet; continue it with `twofold train --resume {folder}`.")
+    require_file(file)
     try:
         with safe_open(file, framework="pt") as stored:
-            return {n: stored.get_tensor(n) for n in stored.keys()}, int((stored.metadata() or {})["step"])  # noqa: SIM118
-    except (SafetensorError, KeyError, ValueError, OSError):
-        raise TwofoldError(f"{file} is damaged; train again.") from None
+            about = stored.metadata() or {}
+            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+    except (SafetensorError, KeyError, ValueError, TypeError, AttributeError, OSError) as error:
+        raise TwofoldError(f"{file} {_DAMAGED}.") from error
+    step = about.get("step", "")
+    if not re.fullmatch(r"[0-9]{1,12}", step):
+        raise TwofoldError(f"{file} is damaged: the step it was written after is {shown(step)}; train again.")
+    # Older checkpoints do not say how many tensors they hold.
+    if about.get("tensors", str(len(tensors))) != str(len(tensors)):
+        raise TwofoldError(f"{file} is damaged: it lacks tensors that it was written with; train again.")
+    return tensors, int(step)
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
     """Puts stored moments back into an optimizer of the same parameters.
 
     Raises:
-        TwofoldError: they belong to other parameters.
+        TwofoldError: they belong to other parameters, or are not all there.
     """
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         if name.startswith("optimizer."):
-            _, index, key = name.split(".")
-            own = int(index) < len(parameters)
-            if not own or (key != "step" and tensor.shape != parameters[int(index)].shape):
+            match = re.fullmatch(r"optimizer\.(\d{1,6})\.(step|exp_avg|exp_avg_sq)", name)
+            index = int(match[1]) if match else len(parameters)
+            fits = index < len(parameters) and _kind(tensor) == (
+                parameters[index].shape if match and match[2] != "step" else torch.Size(),
+                True,
+            )
+            if match is None or not fits or not tensor.isfinite().all():
                 raise TwofoldError(f"The checkpoint does not fit the optimizer (first at {name}); train again.")
-            state.setdefault(int(index), {})[key] = tensor
+            state.setdefault(index, {})[match[2]] = tensor
+    lacking = [
+        f"optimizer.{i}.{key}" for i, s in state.items() for key in ("step", "exp_avg", "exp_avg_sq") if key not in s
+    ]
+    if lacking:
+        raise TwofoldError(f"The checkpoint lacks {lacking[0]}, which the optimizer needs to continue; train again.")
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

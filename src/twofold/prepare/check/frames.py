@@ -14,6 +14,7 @@ from twofold.capture.types import Frame
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.raster import Hits, rasterize
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from twofold.images import read_grey, read_rgb
 from twofold.prepare.check.masks import MaskFacts, mask_facts
 
 LOOKED_AT = 320
@@ -234,14 +235,12 @@ class Look:
 
 def read_bytes(frame: Frame) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
     """Picture and mask as they are stored."""
-    with Image.open(frame.image_file) as picture, Image.open(frame.mask_file) as mask:
-        return np.asarray(picture.convert("RGB")), np.asarray(mask.convert("L"))
+    return read_rgb(frame.image_file), read_grey(frame.mask_file)
 
 
 def read_mask(frame: Frame) -> UInt8[np.ndarray, "h w"]:
     """The mask as it is stored."""
-    with Image.open(frame.mask_file) as mask:
-        return np.asarray(mask.convert("L"))
+    return read_grey(frame.mask_file)
 
 
 def stature(shaped: ShapedBody) -> float:

@@ -17,6 +17,7 @@ from skimage.registration import phase_cross_correlation
 from twofold.body.skeleton import JOINT_NAMES, ShapedBody, joint_transforms
 from twofold.capture.types import Frame
 from twofold.geometry.cameras import project
+from twofold.images import load_image
 
 SIZE = 320
 """Longest side at which backgrounds are compared, pixels."""
@@ -84,9 +85,8 @@ def sees_a_face(frame: Frame, shaped: ShapedBody) -> bool:
     (x, y), up = pixels[1].tolist(), (pixels[1] - pixels[0]).tolist()
     scale = float(frame.camera.intrinsics[0, 0]) / float(depth[1])
     half = 0.5 * HEAD * scale
-    with Image.open(frame.image_file) as picture:
-        # The head's surroundings first: turning a whole picture takes ten times as long.
-        wide = picture.convert("RGB").crop(_box(x, y, 1.5 * half))
+    # The head's surroundings first: turning a whole picture takes ten times as long.
+    wide = load_image(frame.image_file).convert("RGB").crop(_box(x, y, 1.5 * half))
     upright = wide.rotate(math.degrees(math.atan2(up[0], -up[1])), Image.Resampling.BILINEAR)
     middle = upright.width / 2
     head_alone = upright.crop(_box(middle, middle, half)).resize((96, 96), Image.Resampling.BICUBIC)
@@ -114,9 +114,9 @@ def _surroundings(frame: Frame) -> tuple[Float[np.ndarray, "a b"], Bool[np.ndarr
     camera = frame.camera
     scale = min(1.0, SIZE / max(camera.height, camera.width))
     size = (max(round(scale * camera.width), 1), max(round(scale * camera.height), 1))
-    with Image.open(frame.image_file) as picture, Image.open(frame.mask_file) as mask:
-        grey = np.asarray(picture.convert("L").resize(size, Image.Resampling.BOX), np.float32) / 255
-        person = np.asarray(mask.convert("L").resize(size, Image.Resampling.BOX)) > 0
+    picture, mask = (load_image(file).convert("L") for file in (frame.image_file, frame.mask_file))
+    grey = np.asarray(picture.resize(size, Image.Resampling.BOX), np.float32) / 255
+    person = np.asarray(mask.resize(size, Image.Resampling.BOX)) > 0
     return grey, ~np.asarray(ndimage.binary_dilation(person, iterations=max(round(0.02 * max(size)), 1)), dtype=bool)
 
 
