@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.skeleton import JOINT_NAMES, PARENTS, skin
-from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle, rigid_transform
+from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle, rigid_transform, shortest_turn
 
 _LEFT_LIMBS = (
     ("shoulder", "elbow", (0.994, -0.051, -0.095)),
@@ -47,7 +47,7 @@ def straighten(
         places.append(joints[j] if parent < 0 else places[parent] + before @ (joints[j] - joints[parent]))
         if j in limbs:
             child, direction = limbs[j]
-            turns.append(_shortest_turn(before @ (joints[child] - joints[j]), direction) @ before)
+            turns.append(shortest_turn(before @ (joints[child] - joints[j]), direction) @ before)
         else:
             turns.append(upright if JOINT_NAMES[j].endswith("ankle") else before)
     turned, t_joints = torch.stack(turns), torch.stack(places)
@@ -92,10 +92,3 @@ def _nearest_axis(vector: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     axis = torch.zeros_like(vector)
     axis[largest] = vector[largest].sign()
     return axis
-
-
-def _shortest_turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation from the direction `start` to the direction `end` (which must not be opposite)."""
-    normal = torch.linalg.cross(start, end)
-    angle = torch.atan2(normal.norm(), start @ end)
-    return axis_angle_to_matrix(normal / normal.norm().clamp_min(1e-12) * angle)

@@ -54,6 +54,20 @@ def matrix_to_axis_angle(matrix: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3
     return quaternion[..., 1:] * scale
 
 
+def shortest_turn(start: Float[Tensor, "*b 3"], end: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """The smallest rotation from one direction to another (of any length, not opposite).
+
+    >>> turn = shortest_turn(torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 2, 0]))
+    >>> (turn @ torch.tensor([1.0, 0, 0])).round(decimals=6).tolist()
+    [0.0, 1.0, 0.0]
+    """
+    a, b = torch.nn.functional.normalize(start, dim=-1), torch.nn.functional.normalize(end, dim=-1)
+    axis = torch.linalg.cross(a, b, dim=-1)
+    sine = axis.norm(dim=-1, keepdim=True)
+    angle = torch.atan2(sine, (a * b).sum(-1, keepdim=True))
+    return axis_angle_to_matrix(axis / sine.clamp_min(1e-12) * angle)
+
+
 def rigid_transform(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
     """The 4x4 matrix [R t; 0 1]."""
     top = torch.cat([rotation, translation[..., None]], -1)
