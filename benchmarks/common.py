@@ -14,8 +14,8 @@ from pathlib import Path
 import torch
 
 from twofold.capture.folder import read_capture
-from twofold.capture.studio import StudioConfig, make_studio
 from twofold.capture.types import Capture
+from twofold.studio.generate import StudioConfig, make_studio
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -20,11 +20,11 @@ import torch
 from benchmarks.common import store, studio_capture
 from benchmarks.step import reference
 from twofold.capture.types import Capture
-from twofold.demo import demo_recipe
-from twofold.evaluate import measure_split
+from twofold.cli.demo import demo_recipe
+from twofold.evaluation import measure_split
+from twofold.kernels.runtime import tune_process
 from twofold.methods.base import Avatar
-from twofold.speed import tune_process
-from twofold.train import loop
+from twofold.training import loop
 
 SMALL = 48
 """Rows and columns of the pictures that the reference form is asked for."""

@@ -19,12 +19,12 @@ from benchmarks.common import peak_memory_gb, store, studio_capture, timed
 from benchmarks.step import at_work, reference
 from twofold.capture.types import Capture
 from twofold.field.grids import body_distance
+from twofold.kernels.runtime import tune_process
 from twofold.methods.base import Avatar, Subject
 from twofold.methods.factorized import FactorizedAvatar
+from twofold.methods.factorized_recipes import fast, quick
 from twofold.outputs.views import draw
-from twofold.recipes import fast, quick
-from twofold.speed import tune_process
-from twofold.train.loop import train
+from twofold.training.loop import train
 
 
 def seconds(avatar: Avatar, capture: Capture, size: int, repeats: int) -> dict[str, float]:

@@ -17,13 +17,13 @@ from dataclasses import replace
 import torch
 
 from benchmarks.common import peak_memory_gb, store, studio_capture, timed
-from twofold.capture.pixels import PixelSource
+from twofold.kernels.runtime import tune_process
 from twofold.methods.base import Avatar, Subject
 from twofold.methods.factorized import FactorizedConfig
-from twofold.recipes import fast, quick, released
-from twofold.speed import tune_process
-from twofold.train.loop import make_optimizer
-from twofold.train.run import Recipe
+from twofold.methods.factorized_recipes import fast, quick, released
+from twofold.recipe import Recipe
+from twofold.training.loop import make_optimizer
+from twofold.training.pixels import PixelSource
 
 
 def reference() -> Recipe:

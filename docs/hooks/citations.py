@@ -2,7 +2,7 @@
 
 MkDocs calls `on_page_markdown` for each page. `<!-- equations -->` becomes a table of the paper's equations and the
 functions that hold them, `<!-- modules twofold.body -->` the reference of the modules in that package (not in packages
-inside of it). `tests/test_house.py` uses the same reader.
+inside of it). `tests/test_architecture.py` uses the same reader.
 """
 
 import ast

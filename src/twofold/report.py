@@ -15,9 +15,9 @@ from urllib.parse import quote
 
 from twofold.errors import TwofoldError
 from twofold.files import write_bytes
-from twofold.outputs.charts import Chart, Curve, chart_svg
+from twofold.html.charts import Chart, Curve, chart_svg
+from twofold.html.page import Table, Verdict, document, embedded, header, inline, paragraphs, table_html, tiles
 from twofold.outputs.sheets import Picture, as_bytes
-from twofold.page import Table, Verdict, document, embedded, header, inline, paragraphs, table_html, tiles
 
 __all__ = [
     "Chart", "Commands", "Curve", "Figure", "Row", "Section", "Table", "Verdict", "Video",

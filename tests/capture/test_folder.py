@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 from tiny_capture import SPLITS, stick_body, tiny_cameras, tiny_motion, write_tiny
 
-from twofold.capture.contents import read_contents
 from twofold.capture.folder import CaptureWriter, read_capture, read_true_motion
+from twofold.capture.layout import read_contents
 from twofold.capture.validate import joint_positions
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import project

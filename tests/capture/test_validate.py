@@ -8,8 +8,8 @@ import torch
 from PIL import Image
 from tiny_capture import HEIGHT, WIDTH, tiny_cameras, tiny_motion
 
-from twofold.capture.contents import read_contents, spans
 from twofold.capture.folder import read_capture
+from twofold.capture.layout import read_contents, spans
 from twofold.capture.validate import joint_positions, require, validate
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import project

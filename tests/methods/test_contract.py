@@ -5,15 +5,15 @@ import torch
 from little_body import moved_pose
 from small_recipes import CASES, LATE
 
-from twofold.capture.pixels import PixelSource
 from twofold.geometry.cameras import Camera, pixel_grid, pixel_rays
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigid_transform
 from twofold.losses import total
 from twofold.methods.base import Rendering, Subject
 from twofold.methods.placing import ShellSampler
+from twofold.methods.table import RECIPES
 from twofold.outputs.views import draw
-from twofold.recipes import RECIPES
-from twofold.train.run import load_state
+from twofold.training.pixels import PixelSource
+from twofold.training.run import load_state
 
 
 @pytest.fixture(scope="module")

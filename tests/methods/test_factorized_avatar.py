@@ -5,16 +5,16 @@ import pytest
 import torch
 from small_recipes import CASES, LATE
 
-from twofold.capture.pixels import PixelSource
 from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods.base import Subject
 from twofold.methods.factorized import PoseConfig
 from twofold.methods.placing import ShellSampler
 from twofold.metrics.perceptual import LPIPS
 from twofold.outputs.views import draw
-from twofold.train.run import load
+from twofold.sampling.error_bounded import ErrorBoundedSampler
+from twofold.training.pixels import PixelSource
+from twofold.training.run import load
 from twofold.volume.rendering import laplace_density
-from twofold.volume.samplers import ErrorBoundedSampler
 
 QUICK, RELEASED = CASES["quick"].method, CASES["released"].method
 BLACK = torch.zeros(3)

@@ -6,13 +6,13 @@ import pytest
 import torch
 from small_recipes import CASES
 
-from twofold.deform.shell import build_shell
 from twofold.deform.skinning import neighbour_weights
 from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods import factorized
 from twofold.methods.base import Subject
 from twofold.methods.placing import ShellSampler, astray, carried_home, place_in_shell
-from twofold.train.loop import train
+from twofold.sampling.shell import build_shell
+from twofold.training.loop import train
 
 BLACK = torch.zeros(3)
 

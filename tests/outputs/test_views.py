@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from little_body import little_body, moved_pose, posed_little_body
 
 from twofold.body.skeleton import canonical_pose, pose_body, shape_body
-from twofold.deform.shell import build_shell
 from twofold.deform.skinning import vertex_transforms
 from twofold.geometry.cameras import Camera, clip_to_box, pixel_grid, pixel_rays, project
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.methods.base import Avatar, PosedAvatar, Rendering
 from twofold.outputs.views import body_up, draw, look_at, orbit, pose_canonically, rays_at_once
+from twofold.sampling.shell import build_shell
 
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 SHAPED = shape_body(little_body(spacing=0.1), torch.zeros(1))

@@ -11,16 +11,16 @@ from acting import HEIGHT, WIDTH, joints_of
 from PIL import Image, ImageDraw
 from staged import FPS, PLAIN, Stage, names
 
-from twofold.capture.contents import read_contents
 from twofold.capture.folder import read_capture
+from twofold.capture.layout import read_contents
 from twofold.capture.validate import joint_positions, validate
 from twofold.geometry.cameras import project
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.prepare import pipeline
-from twofold.prepare.clips import PrepareConfig
-from twofold.prepare.fit import FitConfig, fit
-from twofold.prepare.observations import Track, mirrored_landmarks
-from twofold.prepare.watch import clean_mask
+from twofold.prepare.detect.scan import clean_mask
+from twofold.prepare.detections import Track, mirrored_landmarks
+from twofold.prepare.fitting.fit import FitConfig, fit
+from twofold.prepare.video.clips import PrepareConfig
 
 
 def splits_of(out):

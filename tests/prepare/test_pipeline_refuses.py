@@ -9,10 +9,10 @@ from acting import HEIGHT
 from PIL import Image
 from staged import PLAIN, Stage, names
 
-from twofold.capture.contents import read_contents
+from twofold.capture.layout import read_contents
 from twofold.errors import TwofoldError
 from twofold.prepare import pipeline
-from twofold.prepare.people import People
+from twofold.prepare.detect.people import People
 from twofold.prepare.pipeline import prepare
 
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from twofold.geometry.cameras import Rays
-from twofold.geometry.samples import Samples
 from twofold.volume.rendering import composite, composite_weights, laplace_density, possible_samples, seen_samples
+from twofold.volume.samples import Samples
 
 
 def literal_density(s, beta):

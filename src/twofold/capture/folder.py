@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from twofold.body.skeleton import Body
-from twofold.capture.contents import (
+from twofold.capture.layout import (
     BODY,
     CHECK,
     DESCRIPTION,

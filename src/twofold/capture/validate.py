@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from twofold.body.skeleton import joint_transforms, shape_body
-from twofold.capture.contents import (
+from twofold.capture.layout import (
     IGNORED,
     IMAGES,
     MASKS,

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from twofold.body.skeleton import PosedBody
-from twofold.geometry.gather import weighted_rows
+from twofold.kernels.sparse_rows import weighted_rows
 
 
 def inverse_skinning(

@@ -10,7 +10,7 @@ scatters, which own their rows) that a call handles.
 
 import numpy as np
 
-from twofold.geometry.threads import compiled
+from twofold.kernels.parallel import compiled
 
 
 @compiled

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from twofold.field import grid_kernels as kernels
 from twofold.geometry.surfaces import nearest_vertices, vertex_normals
-from twofold.geometry.threads import in_parts
+from twofold.kernels.parallel import in_parts
 
 
 @dataclass(frozen=True)

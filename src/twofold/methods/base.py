@@ -10,9 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from twofold.body.skeleton import Body, PosedBody
-from twofold.capture.pixels import Batch
 from twofold.capture.types import Capture
-from twofold.deform.shell import Shell
 from twofold.errors import TwofoldError
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
@@ -92,6 +90,30 @@ class Subject:
 
 
 @dataclass(frozen=True)
+class Batch:
+    """Rays of one picture with what was seen along them.
+
+    Attributes:
+        rays: single pixels first, then patches row by row.
+        color: what the picture shows, on the capture's background, 0..1.
+        mask: share of the pixel that the person covers.
+        singles: how many of the rays are single pixels.
+        patch_pixels: for each pixel of each patch, its ray, or -1 outside the body's box and where pixels are ignored.
+    """
+
+    rays: Rays
+    color: Float[Tensor, "R 3"]
+    mask: Float[Tensor, "R"]
+    singles: int
+    patch_pixels: Int[Tensor, "patches P P"]
+
+    def patches(self, color: Float[Tensor, "R 3"]) -> Float[Tensor, "patches 3 P P"]:
+        """The patches as pictures, from colours along the rays; pixels without a ray are black."""
+        padded = torch.cat([color, torch.zeros_like(color[:1])])
+        return padded[self.patch_pixels].permute(0, 3, 1, 2)
+
+
+@dataclass(frozen=True)
 class PosedAvatar:
     """A body in a pose with what rendering derives from it once.
 
@@ -120,6 +142,14 @@ class Rendering:
     depth: Float[Tensor, "R"]
     normal: Float[Tensor, "R 3"]
     base: "Rendering | None" = None
+
+
+class MethodConfig(ABC):
+    """A method's configuration: a frozen dataclass that builds the method's avatar."""
+
+    @abstractmethod
+    def build(self, subject: Subject, seed: int = 0) -> "Avatar":
+        """An untrained avatar of a subject."""
 
 
 class Avatar(nn.Module, ABC):

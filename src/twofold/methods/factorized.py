@@ -13,25 +13,22 @@ from torch.nn import functional as F
 
 from twofold import losses
 from twofold.body.skeleton import PosedBody, ShapedBody, pose_body, shape_body
-from twofold.capture.pixels import Batch
 from twofold.config import require_within
 from twofold.deform.pose_refinement import PoseRefinement
-from twofold.deform.shell import Shell, build_shell
 from twofold.deform.skinning import (
     neighbour_weights,
     smooth_neighbour_weights,
     to_canonical,
     vertex_transforms,
 )
-from twofold.field.distance_table import DistanceTable, tabulate
 from twofold.field.factorized import FactorizedField, FactorizedFieldConfig
 from twofold.field.factorized_grid import GridField, GridFieldConfig
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
-from twofold.geometry.samples import Samples
 from twofold.geometry.surfaces import nearest_vertices
+from twofold.kernels.runtime import compiled_methods
 from twofold.losses import MOST_STEPS, LossConfig
-from twofold.methods.base import Avatar, PosedAvatar, Rendering, Subject
+from twofold.methods.base import Avatar, Batch, MethodConfig, PosedAvatar, Rendering, Subject
 from twofold.methods.placing import (
     Distance,
     Placed,
@@ -41,9 +38,11 @@ from twofold.methods.placing import (
     that_count,
 )
 from twofold.metrics.perceptual import LPIPS
-from twofold.speed import compiled_methods
+from twofold.sampling.error_bounded import ErrorBoundedSampler
+from twofold.sampling.sdf_grid import DistanceTable, tabulate
+from twofold.sampling.shell import Shell, build_shell
 from twofold.volume.rendering import composite, composite_weights, laplace_density
-from twofold.volume.samplers import ErrorBoundedSampler
+from twofold.volume.samples import Samples
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class PoseConfig:
 
 
 @dataclass(frozen=True)
-class FactorizedConfig:
+class FactorizedConfig(MethodConfig):
     """The factorized avatar; the defaults are the authors' release."""
 
     field: FactorizedFieldConfig | GridFieldConfig = dataclasses.field(default_factory=FactorizedFieldConfig)

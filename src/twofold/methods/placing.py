@@ -9,15 +9,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from twofold.config import require_within
-from twofold.deform.shell import Shell, nearest_listed, sample_shell
 from twofold.deform.skinning import to_canonical
-from twofold.field.distance_table import DistanceTable
 from twofold.geometry.cameras import Rays, clip_to_box
-from twofold.geometry.samples import Samples
-from twofold.geometry.trees import search_tree
+from twofold.kernels.kdtree import search_tree
 from twofold.methods.base import PosedAvatar
+from twofold.sampling.error_bounded import ErrorBoundedSampler
+from twofold.sampling.sdf_grid import DistanceTable
+from twofold.sampling.shell import Shell, nearest_listed, sample_shell
 from twofold.volume.rendering import laplace_density, possible_samples, seen_samples
-from twofold.volume.samplers import ErrorBoundedSampler
+from twofold.volume.samples import Samples
 
 Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 """A field's signed distance at canonical points, metres."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from twofold.errors import TwofoldError
 from twofold.geometry.surfaces import closest_on_triangles, nearest_vertices, sample_surface, vertex_normals
-from twofold.geometry.trees import search_tree
+from twofold.kernels.kdtree import search_tree
 
 SAMPLES = 10_000
 """Points on each surface; where distances spread over 5 mm, their mean is good to 0.05 mm."""

@@ -18,18 +18,20 @@ from twofold.capture.folder import CaptureWriter
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors
 from twofold.geometry.cameras import Camera
-from twofold.prepare.agreement import Agreement, compare_with_pictures
-from twofold.prepare.calibration import pinhole, undistort, undistorter
-from twofold.prepare.clips import Clip, PrepareConfig, advice, longer, open_clips, require_options
-from twofold.prepare.evidence import Evidence
-from twofold.prepare.fit import fit
-from twofold.prepare.given_landmarks import landmarks_from_file, track_at
-from twofold.prepare.given_masks import masks_from_folder
-from twofold.prepare.given_poses import poses_from_file
-from twofold.prepare.motion import Motion, choose, pose_motion
-from twofold.prepare.observations import Estimator, Track
-from twofold.prepare.people import People
-from twofold.prepare.quality import (
+from twofold.prepare.cameras.calibration import pinhole, undistort, undistorter
+from twofold.prepare.cameras.triangulation import triangulate, turn_cameras
+from twofold.prepare.detect.landmark_files import landmarks_from_file, track_at
+from twofold.prepare.detect.left_right import repair_swaps, repair_with_views
+from twofold.prepare.detect.mask_files import masks_from_folder
+from twofold.prepare.detect.people import People
+from twofold.prepare.detect.scan import Watched, watch_clip
+from twofold.prepare.detections import Estimator, Track
+from twofold.prepare.fitting.fit import fit
+from twofold.prepare.fitting.observations import Evidence
+from twofold.prepare.fitting.parameters import Motion, choose, pose_motion
+from twofold.prepare.fitting.pose_files import poses_from_file
+from twofold.prepare.fitting.world_up import stand_upright, up_direction
+from twofold.prepare.output.acceptance import (
     FARTHER,
     LARGER,
     STEADIER,
@@ -41,10 +43,8 @@ from twofold.prepare.quality import (
     warnings_about,
     yaw_range,
 )
-from twofold.prepare.swaps import repair_swaps, repair_with_views
-from twofold.prepare.triangulate import triangulate, turn_cameras
-from twofold.prepare.watch import Watched, watch_clip
-from twofold.prepare.world import stand_upright, up_direction
+from twofold.prepare.output.review import Agreement, compare_with_pictures
+from twofold.prepare.video.clips import Clip, PrepareConfig, advice, longer, open_clips, require_options
 
 Show = Callable[[float, str], None]
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from twofold.geometry.samples import Samples
+from twofold.volume.samples import Samples
 
 
 def laplace_density(sdf: Float[Tensor, "*b"], beta: Float[Tensor, ""]) -> Float[Tensor, "*b"]:

@@ -1,0 +1,146 @@
+"""Commands that make captures and look at them: `twofold studio`, `import`, `prepare`, `check`."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from twofold.cli.console import bar, console, say, within
+
+
+def studio(
+    out: Annotated[Path, tyro.conf.Positional],
+    seed: int = 0,
+    size: int = 256,
+    frames: int = 80,
+    cameras: int = 8,
+    pose_noise: float = 0.0,
+    mask_noise: float = 0.0,
+    background: Literal["black", "textured"] = "black",
+) -> None:
+    """Makes a capture of a person who never lived, with the truth about shape and pose.
+
+    Args:
+        out: Folder to make.
+        seed: Who, wearing what, moving how.
+        size: Rows and columns of the pictures.
+        frames: Moments; the last fifth shows a motion that is not trained on.
+        cameras: In a ring around the person; the first one trains.
+        pose_noise: Error of the given poses, radians (standard deviation).
+        mask_noise: Faults of the masks, 0 to 1.
+        background: What stands behind the person.
+    """
+    from twofold.studio.generate import StudioConfig, make_studio
+
+    config = StudioConfig(seed, size, frames, cameras, pose_noise, mask_noise, background)
+    with bar("Filming") as show:
+        make_studio(config, out, lambda done: show(done, ""))
+    say(f"The capture is in {out}.", f"twofold train {out}")
+
+
+def import_capture(
+    source: Annotated[Path, tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.Positional],
+    held_out: int = 10,
+    drop_below_iou: float = 0.0,
+    held_objects: Literal["keep", "remove"] = "remove",
+) -> None:
+    """Makes a capture folder from one that was prepared elsewhere (images, masks, capture.npz).
+
+    Args:
+        source: Folder with images/, masks/ and capture.npz.
+        out: Folder to make.
+        held_out: Of so many frames one is kept for testing.
+        drop_below_iou: Leaves out frames whose fitted body covers the mask worse than this, 0 to 1.
+        held_objects: Whether a ball or the like that sticks out of or passes in front of the body is taken out.
+    """
+    from twofold.prepare.import_fitted import import_prepared
+
+    import_prepared(source, out, held_out, drop_below_iou, held_objects=held_objects)
+    say(f"The capture is in {out}.", f"twofold check {out}")
+
+
+def prepare(
+    videos: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path,
+    calibration: Path | None = None,
+    fps: float | None = None,
+    max_size: int = 960,
+    intrinsics: str | None = None,
+    body: str = "anny",
+    masks: Path | None = None,
+    landmarks: Path | None = None,
+    poses: Path | None = None,
+    train_camera: str | None = None,
+    held_out: int = 10,
+    held_objects: Literal["keep", "remove"] = "remove",
+    several_people: Literal["refuse", "ignore"] = "refuse",
+    credit: str = "",
+) -> None:
+    """Makes a capture folder from a video of one person, or from several of the same moments.
+
+    Args:
+        videos: A video file or a folder of pictures; several need --calibration.
+        out: Capture folder to make.
+        calibration: Cameras of several videos: Qualisys .qca.txt, intri.yml and extri.yml, Pose2Sim .toml, or JSON.
+        fps: Pictures a second to use; by default all.
+        max_size: Longer side of the pictures in pixels; larger ones are made smaller.
+        intrinsics: fx,fy,cx,cy of the one camera in pixels of its video; found roughly where not given.
+        body: anny, or your own SMPL file.
+        masks: Your own masks instead of the estimator's: a folder (one folder for each of several videos in it).
+        landmarks: Your own landmarks: a file (a folder with one file for each of several videos).
+        poses: Your own poses of the body, as npz with poses, translations and betas; nothing is fitted then.
+        train_camera: Which of several videos trains; by default the first.
+        held_out: Of so many moments one is kept for testing.
+        held_objects: Whether a ball or the like is taken out of the masks.
+        several_people: Whether a second person in view ends it, or is left to the masks.
+        credit: Whom to name when showing the pictures.
+    """
+    from twofold.prepare.detect.blazepose import mediapipe_estimator
+    from twofold.prepare.detect.people import count_people
+    from twofold.prepare.pipeline import prepare as make
+    from twofold.prepare.pipeline import read_body
+    from twofold.prepare.video.clips import PrepareConfig, read_intrinsics
+
+    config = PrepareConfig(
+        fps, max_size, read_intrinsics(intrinsics), calibration, train_camera, held_out, held_objects, credit,
+        masks, landmarks, poses, several_people,
+    )  # fmt: skip
+    with bar("Preparing") as show:
+        prepared = make(videos, out, read_body(body), mediapipe_estimator, config, show, count_people)
+    for sentence in prepared.warnings:
+        console().print(f"Note: {sentence}", soft_wrap=True)
+    say(f"The capture is in {out}: {prepared.summary()}", f"twofold check {out}")
+
+
+def check(
+    capture: Annotated[Path, tyro.conf.Positional],
+    out: Path | None = None,
+    most: int = 100,
+) -> None:
+    """Says whether a capture is worth training on, and what to mend; exit code 1 where training would be wasted.
+
+    Args:
+        capture: Capture folder.
+        out: Folder for the page and its numbers; by default CAPTURE/check.
+        most: At most so many pictures are looked at, spread evenly.
+    """
+    from twofold.check.check_report import require_no_file, write_check
+    from twofold.check.measure import measure_capture
+    from twofold.check.rules import judge
+
+    within(most=(most, 2, None))
+    require_no_file(out or capture / "check")
+    with bar("Checking") as show:
+        facts, read = measure_capture(capture, most, lambda done: show(0.9 * done, ""))
+        judgement = judge(facts)
+        page = write_check(facts, read, judgement, out or capture / "check")
+        show(1.0, "")
+    for finding in judgement.findings:
+        console().print(f"{finding.level}: {finding}", soft_wrap=True)
+    console().print(judgement.words, soft_wrap=True)
+    wasted = judgement.level == "waste"
+    say(f"The page is {page}.", "mend what it names and check again" if wasted else f"twofold train {capture}")
+    if wasted:
+        sys.exit(1)

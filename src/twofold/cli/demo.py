@@ -1,0 +1,182 @@
+"""`twofold demo`: film a made-up person, train, measure, show. The whole idea in three minutes on two cores."""
+
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from twofold.capture.folder import read_capture
+from twofold.capture.types import Capture, Frame, spread
+from twofold.errors import TwofoldError
+from twofold.evaluation import evaluate, with_protocols
+from twofold.files import plain_errors, write_json
+from twofold.html.charts import Chart, Curve
+from twofold.methods.base import Avatar
+from twofold.methods.factorized_recipes import quick
+from twofold.metrics.image import to_8bit
+from twofold.outputs.gallery import comparison, motion_frames, orbit_frames, panels, save_png, scene_up
+from twofold.outputs.sheets import sheet
+from twofold.outputs.video import write_video
+from twofold.outputs.views import draw, orbit, pose_canonically
+from twofold.recipe import Recipe
+from twofold.report import Commands, Figure, Row, Section, Video, metrics_table, verdict, write_report
+from twofold.studio.generate import StudioConfig, make_studio
+from twofold.training.loop import Progress, train
+
+SIZE, FRAMES, CAMERAS = 192, 50, 4
+"""Of the demo's capture: 40 moments to train on, 10 with another motion, one camera to train on and three to test."""
+
+
+def demo_recipe(seed: int) -> Recipe:
+    """`quick` with as many steps as two minutes of two cores hold."""
+    recipe = quick()
+    # With few pictures and exact poses, slower rates show unseen views better.
+    rates = {"rate_grid": 5e-3, "rate_low": 1e-3, "rate_high": 1e-3}
+    training = replace(recipe.training, steps=900, checkpoint_every=300, preview_every=0, **rates)
+    # The studio's poses are exact; there is nothing to correct.
+    method = replace(recipe.method, pose=replace(recipe.method.pose, refine=()))
+    return replace(recipe, name="demo", method=method, training=training, seed=seed)
+
+
+def run_demo(out: Path, seed: int, show: Callable[[float, str], None]) -> Path:
+    """Does it all.
+
+    Args:
+        out: folder to make; a demo that lies there gives way.
+        seed: who is filmed.
+        show: told the share that is done and what is being done.
+
+    Returns:
+        the page.
+
+    Raises:
+        TwofoldError: `out` holds something else, or cannot be written.
+    """
+    with plain_errors(out):
+        if out.exists() and any(out.iterdir()) and not (out / "capture" / "capture.json").is_file():
+            raise TwofoldError(f"{out} holds something that is no demo; choose another --out or empty it.")
+    begun = time.monotonic()
+    seconds: dict[str, float] = {}
+
+    def lap(name: str) -> None:
+        seconds[name] = time.monotonic() - begun - sum(seconds.values())
+
+    show(0.0, "filming a made-up person")
+    config = StudioConfig(seed=seed, size=SIZE, frames=FRAMES, cameras=CAMERAS)
+    shutil.rmtree(out / "capture", ignore_errors=True)
+    make_studio(config, out / "capture", lambda done: show(0.12 * done, "filming a made-up person"))
+    capture = read_capture(out / "capture")
+    lap("studio")
+
+    run = out / "run"
+    (run / "checkpoint.safetensors").unlink(missing_ok=True)
+    curve: list[tuple[int, float]] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.step % 20 == 0 or progress.step == 1:
+            curve.append((progress.step, progress.psnr))
+        share = 0.12 + 0.68 * progress.step / progress.steps
+        show(share, f"training, step {progress.step} of {progress.steps}, {progress.psnr:.1f} dB")
+
+    avatar = train(capture, demo_recipe(seed), run, torch.device("cpu"), watch=watch)
+    lap("training")
+
+    show(0.8, "measuring")
+    metrics = evaluate(avatar, capture, run, most=9, meshes=2)
+    lap("evaluation")
+    show(0.9, "drawing")
+    pictures = _pictures(avatar, capture, out)
+    lap("pictures")
+    seconds["total"] = time.monotonic() - begun
+    metrics["seconds"] = {**seconds, "protocol": "wall-clock time of the parts of this demo on this machine"}
+    write_json(out / "metrics.json", metrics)
+    page = _page(out, seed, metrics, curve, pictures)
+    show(1.0, "done")
+    return page
+
+
+def _pictures(avatar: Avatar, capture: Capture, out: Path) -> list[Path]:
+    folder = out / "pictures"
+    save_png(folder / "novel_view.png", comparison(avatar, capture, _one_each(capture.splits["novel_view"])))
+    save_png(folder / "novel_pose.png", comparison(avatar, capture, _one_each(capture.splits["novel_pose"])))
+    background = torch.tensor(capture.background)
+    posed = pose_canonically(avatar)
+    parts = [panels(draw(avatar, posed, camera, background)) for camera in orbit(posed, 256, 2)]
+    save_png(folder / "canonical.png", sheet([list(p.values()) for p in parts], ["front", "back"], list(parts[0])))
+    frame = capture.train[0]
+    turning = orbit_frames(avatar, avatar.pose(frame.pose, frame.translation), capture, 256, 24, scene_up(capture))
+    write_video(folder / "orbit.mp4", (to_8bit(picture.color).numpy() for picture in turning), 12)
+    write_video(folder / "novel_pose.mp4", motion_frames(avatar, capture, "novel_pose", 192), 6)
+    return [
+        folder / name for name in ("novel_view.png", "novel_pose.png", "canonical.png", "orbit.mp4", "novel_pose.mp4")
+    ]
+
+
+def _one_each(frames: tuple[Frame, ...]) -> list[Frame]:
+    """One frame of each camera, at moments spread over the split."""
+    cameras = sorted({frame.camera_name for frame in frames})
+    chosen = []
+    for number, camera in enumerate(cameras):
+        own = [frame for frame in frames if frame.camera_name == camera]
+        chosen.append(own[round((number + 0.5) / len(cameras) * (len(own) - 1))])
+    return chosen or spread(frames, 3)
+
+
+def _page(
+    out: Path, seed: int, metrics: dict[str, object], curve: list[tuple[int, float]], pictures: list[Path]
+) -> Path:
+    by_name = {path.stem if path.suffix == ".png" else path.name: path for path in pictures}
+    steps, values = [step for step, _ in curve], [value for _, value in curve]
+    shown = (
+        "Truth, the avatar, and what it is made of: the pose-independent base, what the pose adds, normals, opacity."
+    )
+    sections = [
+        Section(
+            "Seen from where no camera stood",
+            f"One camera trained the avatar. These are moments of its motion, seen by the other three. {shown}",
+            (Row((Figure(by_name["novel_view"]),)),),
+        ),
+        Section(
+            "In poses it never saw",
+            f"Another motion of the same person, from the same unseen cameras. {shown}",
+            (Row((Figure(by_name["novel_pose"]),)), Video("pictures/novel_pose.mp4", "Full avatar and its base.")),
+        ),
+        Section(
+            "The canonical avatar",
+            "All frames are explained by one person in one pose; the low-frequency branch holds what is the same in "
+            "all of them, the high-frequency branch what comes and goes with the pose.",
+            (Row((Figure(by_name["canonical"]),)), Video("pictures/orbit.mp4", "All around.")),
+        ),
+        Section("Training", "", (Chart("PSNR over each step's rays, dB", (Curve("PSNR", steps, values),)),)),
+        Section("Every figure, and how it was measured", "", (metrics_table(with_protocols(metrics)),)),
+        Section(
+            "Go on",
+            "",
+            (
+                Commands(
+                    (
+                        (f"twofold render {out / 'run'}", "more pictures of this avatar"),
+                        ("twofold studio mine --seed 7", "film somebody else"),
+                        ("twofold train mine", "and train on that"),
+                    )
+                ),
+            ),
+        ),
+    ]
+    verdicts = [
+        verdict(metrics, "novel_view.psnr_box", "novel view", "dB", at_least=26),
+        verdict(metrics, "novel_pose.psnr_box", "novel pose", "dB", at_least=24),
+        verdict(metrics, "geometry.chamfer_cm", "surface error", "cm", at_most=1.0),
+        verdict(metrics, "seconds.total", "time", "s", at_most=180),
+    ]
+    return write_report(
+        out,
+        "An animatable avatar from one camera",
+        sections,
+        f"Studio person {seed}: {FRAMES * 4 // 5} training pictures of {SIZE} x {SIZE}, recipe quick.",
+        verdicts,
+        Video("pictures/orbit.mp4"),
+    )

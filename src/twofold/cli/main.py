@@ -1,0 +1,268 @@
+"""The command line: `twofold studio`, `import`, `prepare`, `check`, `train`, `render`, `evaluate`, `demo`.
+
+What a command needs is imported when it runs, so that `--help` answers at once.
+"""
+
+import functools
+import os
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from twofold.cli.captures import check, import_capture, prepare, studio
+from twofold.cli.console import ALONE, bar, console, say, within
+from twofold.errors import TwofoldError
+
+if TYPE_CHECKING:
+    from twofold.recipe import Recipe
+
+Parts = Literal["all", "orbit", "views", "poses", "canonical"]
+Recipes = Literal["quick", "fast", "released", "paper"]
+
+
+def train(
+    capture: Annotated[Path | None, tyro.conf.Positional] = None,
+    out: Path | None = None,
+    recipe: Recipes = "quick",
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    seed: int = 0,
+    device: str = "auto",
+    resume: Path | None = None,
+    settings: bool = False,
+) -> None:
+    """Trains an avatar from a capture folder.
+
+    Args:
+        capture: Capture folder (`twofold prepare`, `twofold studio`, `twofold import`).
+        out: Run folder to make; by default runs/NAME-RECIPE.
+        recipe: quick (minutes on a CPU), fast (the released networks, sampled near the body), released, paper.
+        set: Settings, such as training.steps=500; one or several, once or several times.
+        seed: Of everything random.
+        device: auto, cpu, cuda or cuda:N.
+        resume: Run folder of an interrupted training to continue.
+        settings: Shows every setting that --set can change, as the recipe has it, and does nothing else.
+    """
+    if settings:
+        _show_settings(recipe, set, seed)
+        return
+    from twofold.capture.folder import read_capture
+    from twofold.capture.validate import require, validate
+    from twofold.outputs.gallery import save_preview
+    from twofold.train import loop
+    from twofold.training.run import RECIPE, choose_device, find_capture, read_recipe
+
+    if resume is None:
+        chosen, folder, source = _new_run(capture, out, recipe, set, seed)
+    elif set or out or seed or recipe != "quick":
+        raise TwofoldError(
+            "--resume continues a run as it was begun; leave --set, --out, --seed and --recipe out, or start a new run."
+        )
+    else:
+        chosen, folder = read_recipe(resume), resume
+        source = find_capture(resume, capture, "twofold train CAPTURE --resume RUN")
+    where = choose_device(device)
+    require(validate(source), source)
+    read = read_capture(source)
+    try:
+        with bar("Training") as show:
+            loop.train(
+                read, chosen, folder, where, resume is not None,
+                lambda p: show(p.step / p.steps, f"step {p.step}  loss {sum(p.losses.values()):.4f}  {p.psnr:.1f} dB"),
+                _attach_lpips,
+                lambda avatar, step: save_preview(avatar, read, folder, step),
+                lambda note: console().print(note, soft_wrap=True),
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        if not (folder / RECIPE).is_file():
+            raise
+        moved = [str(capture)] if resume and capture else []
+        where_asked = ["--device", device] if device != "auto" else []
+        words = ["twofold", "train", *moved, "--resume", str(folder), *where_asked]
+        raise KeyboardInterrupt(f"The training continues with: {shlex.join(words)}") from None
+    moved = capture if resume else None
+    say(f"The avatar is in {folder}.", _with_capture(["twofold", "render", str(folder)], moved))
+
+
+def _show_settings(recipe: Recipes, overrides: tuple[str, ...], seed: int) -> None:
+    """Every setting on a line of standard output."""
+    from twofold.config import describe, with_overrides
+    from twofold.methods.table import RECIPES
+
+    lines = describe(with_overrides(RECIPES[recipe](), [f"seed={seed}", *overrides]))
+    try:
+        print("\n".join(lines), flush=True)
+    except BrokenPipeError:  # whoever reads, `head` say, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _new_run(
+    capture: Path | None, out: Path | None, recipe: Recipes, overrides: tuple[str, ...], seed: int
+) -> "tuple[Recipe, Path, Path]":
+    """Recipe, folder and capture of a run to begin."""
+    from twofold.config import with_overrides
+    from twofold.methods.table import RECIPES
+    from twofold.training.run import require_free
+
+    if capture is None:
+        raise TwofoldError("Expected a capture folder (`twofold train CAPTURE`) or --resume RUN; neither was given.")
+    folder = out or Path("runs") / f"{capture.resolve().name}-{recipe}"
+    require_free(folder)
+    return with_overrides(RECIPES[recipe](), [f"seed={seed}", *overrides]), folder, capture
+
+
+def _attach_lpips(avatar: object) -> str | None:
+    """Gives the avatar its perceptual loss where its recipe has one; tells whether it has it."""
+    from twofold.methods.factorized import FactorizedAvatar
+    from twofold.metrics.perceptual import load_lpips, weights_hint
+
+    if not isinstance(avatar, FactorizedAvatar) or not avatar.config.losses.lpips:
+        return None
+    network = load_lpips()
+    avatar.attach_lpips(network)
+    return weights_hint() if network is None else "LPIPS is part of the loss."
+
+
+def render(
+    run: Annotated[Path, tyro.conf.Positional],
+    what: Parts = "all",
+    size: int = 512,
+    capture: Path | None = None,
+    out: Path | None = None,
+    chunk: int | None = None,
+    device: str = "auto",
+) -> None:
+    """Draws an avatar: an orbit, unseen views, unseen poses, front and back; branches, normals, opacity.
+
+    Args:
+        run: Run folder.
+        what: Everything, or one part.
+        size: Rows of the pictures of the orbit and of the canonical pose, 16 to 4096.
+        capture: Capture folder, if it has moved since training.
+        out: Folder for the pictures; by default RUN/renders.
+        chunk: Rays at once; by default as many as the free memory holds.
+        device: auto, cpu, cuda or cuda:N.
+    """
+    from twofold.capture.folder import read_capture
+    from twofold.outputs.gallery import render_run
+    from twofold.training.run import choose_device, find_capture, load, require_same
+
+    within(size=(size, 16, 4096), chunk=(chunk, 1, None))
+    avatar, _ = load(run, choose_device(device))
+    read = read_capture(find_capture(run, capture))
+    require_same(run, read, motion=False)
+    folder = out or run / "renders"
+    with bar("Drawing") as show:
+        render_run(avatar, read, folder, what, size, chunk, lambda done: show(done, ""))
+    say(f"The pictures are in {folder}.", _with_capture(["twofold", "evaluate", str(run)], capture))
+
+
+def evaluate(
+    run: Annotated[Path, tyro.conf.Positional],
+    capture: Path | None = None,
+    most: int | None = None,
+    meshes: int | None = 4,
+    device: str = "auto",
+) -> None:
+    """Measures an avatar against what its capture knows to be true; writes RUN/metrics.json.
+
+    Args:
+        run: Run folder.
+        capture: Capture folder, if it has moved since training.
+        most: At most so many pictures a split; by default all.
+        meshes: At most so many true meshes.
+        device: auto, cpu, cuda or cuda:N.
+    """
+    from twofold.capture.folder import read_capture
+    from twofold.evaluation import evaluate as measure
+    from twofold.training.run import choose_device, find_capture, load, require_same
+
+    within(most=(most, 1, None), meshes=(meshes, 0, None))
+    avatar, _ = load(run, choose_device(device))
+    read = read_capture(find_capture(run, capture))
+    require_same(run, read, motion=True)
+    with bar("Measuring") as show:
+        metrics = measure(avatar, read, run, most, meshes, show)
+    for section, values in metrics.items():
+        if isinstance(values, dict):
+            numbers = {k: v for k, v in values.items() if isinstance(v, float)}
+            line = f"{section}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items())
+            console().print(line, soft_wrap=True)
+    say(f"The figures are in {run / 'metrics.json'}.", _with_capture(["twofold", "render", str(run)], capture))
+
+
+def _with_capture(words: list[str], capture: Path | None) -> str:
+    """A command about a run, which has to be told of a capture that has moved as the one before it was."""
+    return shlex.join([*words, *(["--capture", str(capture)] if capture else [])])
+
+
+def demo(out: Path = Path("demo"), seed: int = 0) -> None:
+    """The whole idea in three minutes: films a made-up person, trains an avatar, measures it, shows it on a page.
+
+    Args:
+        out: Folder to make.
+        seed: Who is filmed.
+    """
+    from twofold.cli.demo import run_demo
+
+    with bar("Demo") as show:
+        page = run_demo(out, seed, show)
+    say(f"The page is {page}.", f"open {page}, or train on your own: twofold train CAPTURE")
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": demo,
+    "studio": studio,
+    "import": import_capture,
+    "prepare": prepare,
+    "check": check,
+    "train": train,
+    "render": render,
+    "evaluate": evaluate,
+}
+
+
+def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """The command with the same arguments, to be run when they have all been read."""
+
+    @functools.wraps(command)
+    def chosen(*args: object, **options: object) -> Callable[[], None]:
+        return functools.partial(command, *args, **options)
+
+    return chosen
+
+
+def _one_by_one(words: Sequence[str]) -> list[str]:
+    """`--set a=1 b=2` as `--set a=1 --set b=2`, which is how the parser takes lists of any length."""
+    spread: list[str] = []
+    setting = False
+    for word in words:
+        setting = word == "--set" or (setting and "=" in word and not word.startswith("-"))
+        if setting and word != "--set" and spread[-1] != "--set":
+            spread.append("--set")
+        spread.append(word)
+    return spread
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the `twofold` command: exit code 0, 1 where a check fails, 2 for bad input, 130 after Ctrl-C."""
+    try:
+        command = tyro.extras.subcommand_cli_from_dict(
+            {name: _later(command) for name, command in COMMANDS.items()}, prog="twofold",
+            args=_one_by_one(sys.argv[1:] if arguments is None else arguments),
+            description="A video of a person goes in, an avatar comes out.", config=(tyro.conf.AvoidSubcommands,),
+        )  # fmt: skip
+        from twofold.kernels.runtime import tune_process
+
+        tune_process()
+        command()
+    except TwofoldError as error:
+        print(f"twofold{'' if ALONE else ', process ' + os.environ['RANK']}: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt as stop:
+        if ALONE:
+            print(" ".join(["twofold: stopped.", *map(str, stop.args)]), file=sys.stderr)
+        sys.exit(130)

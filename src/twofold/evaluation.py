@@ -1,0 +1,242 @@
+"""Evaluation: which frames are measured, how, and the file that says so."""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from twofold.capture.types import Capture, Frame, spread
+from twofold.capture.validate import read_mesh
+from twofold.deform.pose_refinement import PoseRefinement
+from twofold.files import write_json
+from twofold.methods.base import Avatar, PosedAvatar
+from twofold.metrics import image as image_metrics
+from twofold.metrics import shape as shape_metrics
+from twofold.outputs.mesh import extract_surface, pose_surface
+from twofold.outputs.views import Picture, draw
+
+
+def truth(frame: Frame, background: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
+    """A frame's picture on the capture's background, and its mask."""
+    mask = frame.mask()
+    return frame.image() * mask[..., None] + torch.tensor(background) * (1 - mask[..., None]), mask
+
+
+NEAR = 0.5
+"""Seconds over which the errors of an estimator's poses last."""
+_MESH = 4
+"""Pictures that can be measured while one surface is."""
+
+
+def draw_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) -> Picture:
+    """The avatar in a frame's pose from its camera; `refined` applies what was learned about poses at that time."""
+    posed = pose_at(avatar, capture, frame) if refined else avatar.pose(frame.pose, frame.translation, None)
+    return draw(avatar, posed, frame.camera, torch.tensor(capture.background))
+
+
+_REFINED = (
+    "as refined in training from the training pictures; a moment between two that were trained on takes the mean of "
+    "their corrections, nothing of its own picture"
+)
+
+
+def _refines(avatar: Avatar) -> bool:
+    refinement = getattr(avatar, "refinement", None)
+    return isinstance(refinement, PoseRefinement) and bool(refinement.parts)
+
+
+def pose_at(avatar: Avatar, capture: Capture, frame: Frame) -> PosedAvatar:
+    """The avatar in a frame's pose, with what training learned about the errors of the capture's poses.
+
+    A moment that was trained on has a correction of its own. Another one between two of these takes theirs, mixed, if
+    they are no more than `NEAR` seconds apart. All others stay as the capture has them.
+    """
+    refinement = getattr(avatar, "refinement", None)
+    if not isinstance(refinement, PoseRefinement) or not refinement.parts or frame.time in refinement.rows:
+        return avatar.pose(frame.pose, frame.translation, frame.time)
+    known = {f.time: f for f in capture.train}
+    before = max((t for t in known if t < frame.time), default=None)
+    after = min((t for t in known if t > frame.time), default=None)
+    if before is None or after is None or (after - before) / capture.fps > NEAR:
+        return avatar.pose(frame.pose, frame.translation, None)
+    neighbours = tuple((t, known[t].pose, known[t].translation) for t in (before, after))
+    on = refinement.root.device
+    with torch.no_grad():
+        neighbours = tuple((t, pose.to(on), place.to(on)) for t, pose, place in neighbours)
+        pose, translation = refinement.between(neighbours, frame.time, frame.pose.to(on), frame.translation.to(on))
+    return avatar.pose(pose, translation, None)
+
+
+def measure_split(
+    avatar: Avatar, capture: Capture, split: str, most: int | None = None, refined: bool = False,
+    watch: Callable[[Frame, Picture], None] | None = None,
+) -> dict[str, object]:  # fmt: skip
+    """Means of all picture figures over a split's frames.
+
+    Args:
+        avatar: to measure.
+        capture: with the true pictures.
+        split: "train", "novel_view" or "novel_pose".
+        most: at most so many frames, evenly spread; None for all.
+        refined: apply what training learned about the poses (`pose_at`).
+        watch: called with every frame and its rendering.
+    """
+    rows, shares = [], []
+    frames = spread(capture.splits.get(split, ()), most)
+    for frame in frames:
+        picture = draw_frame(avatar, capture, frame, refined)
+        image, mask = truth(frame, capture.background)
+        ignored = frame.ignored()
+        rows.append(image_metrics.compare(picture.color, image, picture.opacity, mask, ignored))
+        shares.append(ignored[image_metrics.subject_box(mask)].float().mean().item())
+        if watch:
+            watch(frame, picture)
+    if not rows:
+        return {}
+    means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    poses = _REFINED if refined and _refines(avatar) else "as the capture gives them"
+    times = len({frame.time for frame in frames})
+    cameras = len({frame.camera_name for frame in frames})
+    protocol = {
+        **image_metrics.PROTOCOLS,
+        "frames": f"mean over {len(frames)} pictures of the split {split}: {times} moments, {cameras} cameras",
+        "poses": poses,
+        "background": f"constant {capture.background}",
+    }
+    if any(shares):
+        protocol["ignored"] = image_metrics.IGNORED_PROTOCOL.format(share=100 * float(np.mean(shares)))
+    return means | {"protocol": protocol}
+
+
+def _level(avatar: Avatar, posed: PosedAvatar, x: Tensor) -> Tensor:
+    return avatar.level(x.to(posed.forward.device), posed)
+
+
+def _with_mesh(capture: Capture, most: int | None) -> dict[int, Frame]:
+    moments = {f.time: f for split in ("novel_view", "novel_pose", "train") for f in capture.splits.get(split, ())}
+    return {time: moments[time] for time in spread([t for t in sorted(capture.meshes) if t in moments], most)}
+
+
+def measure_geometry(
+    avatar: Avatar, capture: Capture, most: int | None = None, voxel: float = 0.008,
+    watch: Callable[[], None] | None = None,
+) -> dict[str, object]:  # fmt: skip
+    """Means of the surface figures over the moments whose true mesh is known; empty where none is."""
+    rows = []
+    for time, frame in _with_mesh(capture, most).items():
+        posed = avatar.pose(frame.pose, frame.translation, None)
+        surface, faces = extract_surface(functools.partial(_level, avatar, posed), posed.body.canonical_vertices, voxel)
+        vertices = pose_surface(surface, posed.body)
+        rows.append(shape_metrics.compare_surfaces(vertices.cpu(), faces.cpu(), *read_mesh(capture.meshes[time])))
+        if watch:
+            watch()
+    if not rows:
+        return {}
+    means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    means["protocol"] = {
+        **shape_metrics.PROTOCOLS,
+        "surface": f"marching cubes of the signed distance at {1000 * voxel:g} mm in canonical space, largest piece, "
+        "posed by the 7 nearest body vertices",
+        "moments": f"mean over {len(rows)} moments with a true mesh",
+    }
+    return means
+
+
+def measure_refinement(
+    avatar: Avatar, capture: Capture, most: int, trained: dict[str, object] | None = None,
+    watch: Callable[[Frame, Picture], None] | None = None,
+) -> dict[str, object]:  # fmt: skip
+    """How far training moved the poses, and the same avatar in the poses before and after, in at most `most` pictures.
+
+    Held-out moments are of the split "novel_pose"; without a training moment near them their poses stay as they are.
+    `trained` are the training pictures' figures in the poses after, where the caller has them already.
+    """
+    refinement = avatar.refinement
+    assert isinstance(refinement, PoseRefinement)
+    found: dict[str, object] = dict(refinement.change())
+    told = {"shape": "length of the change of the coefficients"}
+    for name, unit in (("root", "radians"), ("body", "radians"), ("translation", "metres")):
+        told[name] = f"root mean square change over the training moments, {unit}"
+    poses = {"before": "the poses of the capture", "after": "the poses that training made of them"}
+    for split, called, known in (("train", "train", trained), ("novel_pose", "held_out", None)):
+        for when in poses if refinement.parts else ():
+            after = when == "after"
+            figures = known if known and after else measure_split(avatar, capture, split, most, after, watch)
+            for figure in ("psnr_box", "silhouette_iou") if figures else ():
+                found[f"{called}_{figure}_{when}"] = figures[figure]
+                told[f"{called}_{figure}_{when}"] = f"up to {most} pictures of the split {split} in {poses[when]}"
+    return found | {"protocol": told}
+
+
+def evaluate(
+    avatar: Avatar, capture: Capture, folder: Path, most: int | None = None, meshes: int | None = 4,
+    show: Callable[[float, str], None] | None = None, extra: dict[str, object] | None = None,
+) -> dict[str, object]:  # fmt: skip
+    """Measures everything that the capture knows the truth of and writes `metrics.json` into the run.
+
+    Args:
+        avatar: to measure.
+        capture: with the truth.
+        folder: the run.
+        most: at most so many pictures a split.
+        meshes: at most so many true meshes.
+        show: told the share that is done and what is being measured.
+        extra: further sections for the file.
+
+    Raises:
+        TwofoldError: a picture or mesh is damaged, or the avatar's numbers are not finite.
+    """
+    few = min(most or 8, 8)
+    for time in _with_mesh(capture, meshes):
+        read_mesh(capture.meshes[time])  # before hours of work
+    pictures = {name: len(spread(capture.splits.get(name, ()), most)) for name in ("novel_view", "novel_pose")}
+    pictures["train"] = len(spread(capture.train, few))
+    # Training pictures are drawn once more, in the poses as given; held-out ones in both.
+    refined = pictures["train"] + 2 * min(pictures["novel_pose"], few) if _refines(avatar) else 0
+    to_do = sum(pictures.values()) + refined + _MESH * len(_with_mesh(capture, meshes))
+    done = 0
+
+    def watch(what: str, pictures: int = 1) -> None:
+        nonlocal done
+        done += pictures
+        if show:
+            show(done / max(to_do, 1), what)
+
+    metrics: dict[str, object] = {}
+    for split in ("novel_view", "novel_pose"):
+        part = measure_split(avatar, capture, split, most, True, lambda f, p, s=split: watch(s))
+        if part:
+            metrics[split] = part
+    metrics["train"] = trained = measure_split(avatar, capture, "train", few, True, lambda f, p: watch("train"))
+    geometry = measure_geometry(avatar, capture, meshes, watch=lambda: watch("geometry", _MESH))
+    if geometry:
+        metrics["geometry"] = geometry
+    if isinstance(getattr(avatar, "refinement", None), PoseRefinement):
+        metrics["pose_refinement"] = measure_refinement(
+            avatar, capture, few, trained, lambda f, p: watch("pose refinement")
+        )
+    metrics |= extra or {}
+    write_json(folder / "metrics.json", metrics)
+    return metrics
+
+
+def with_protocols(metrics: dict[str, object]) -> dict[str, object]:
+    """The figures for a table: each number of a section beside its protocol, general remarks as a line of their own."""
+    out: dict[str, object] = {}
+    for section, values in metrics.items():
+        if not isinstance(values, dict):
+            out[section] = values
+            continue
+        protocol = values.get("protocol", {})
+        lines: dict[str, object] = {}
+        for name, value in values.items():
+            if name != "protocol":
+                own = protocol.get(name, "") if isinstance(protocol, dict) else protocol
+                lines[name] = {"value": value, "protocol": own}
+        if isinstance(protocol, dict):
+            lines |= {name: {"value": "", "protocol": text} for name, text in protocol.items() if name not in values}
+        out[section] = lines
+    return out

@@ -1,0 +1,64 @@
+"""The methods: one line each. Recipes, command-line choices and tests are made from this table."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+from twofold.config import KIND, from_dict, to_dict
+from twofold.errors import TwofoldError
+from twofold.methods import factorized_recipes
+from twofold.methods.base import MethodConfig
+from twofold.methods.factorized import FactorizedConfig
+from twofold.recipe import Recipe
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method: its configuration class and its recipes by name."""
+
+    config: type[MethodConfig]
+    recipes: dict[str, Callable[[], Recipe]]
+
+
+METHODS: dict[str, Method] = {
+    "factorized": Method(FactorizedConfig, factorized_recipes.RECIPES),
+}
+"""Every method by its name. A recipe stored without a kind is of the first."""
+
+RECIPES: dict[str, Callable[[], Recipe]] = {
+    name: recipe for method in METHODS.values() for name, recipe in method.recipes.items()
+}
+"""What `--recipe` offers; the first is the default."""
+
+
+def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
+    """A recipe as JSON data; the method's configuration carries the name of its class."""
+    plain = to_dict(dataclasses.replace(recipe, method=None))
+    kind = type(recipe.method).__name__
+    return {**plain, "method": {KIND: kind, **to_dict(recipe.method)}}
+
+
+def recipe_from_dict(data: object, where: str) -> Recipe:
+    """What `recipe_to_dict` gave, read back.
+
+    Args:
+        data: JSON data.
+        where: the file, for messages.
+
+    Raises:
+        TwofoldError: an unknown method or setting, or a value that does not fit.
+    """
+    if not isinstance(data, dict):
+        raise TwofoldError(f"{where} should hold an object with a recipe; it holds {type(data).__name__}.")
+    whole = cast(dict[str, Any], data)
+    method = whole.get("method")
+    if not isinstance(method, dict):
+        raise TwofoldError(f"{where} lacks the method's settings, an object called method; it is damaged.")
+    settings = dict(cast(dict[str, Any], method))
+    classes = {m.config.__name__: m.config for m in METHODS.values()}
+    kind = settings.pop(KIND, next(iter(classes)))
+    if kind not in classes:
+        raise TwofoldError(f"method in {where} has the unknown kind {kind!r}; known are {', '.join(classes)}.")
+    rest = from_dict(Recipe, {**whole, "method": None}, where)
+    return dataclasses.replace(rest, method=from_dict(classes[kind], settings, f"method in {where}"))

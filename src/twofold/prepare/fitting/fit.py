@@ -1,0 +1,250 @@
+"""Fits a body to the landmarks and masks of a whole clip, seen by one camera or by several.
+
+All moments are fitted together, in three stages: the landmarks' directions in space give a first guess; then the body's
+points are moved to where the landmarks are seen; then its outline is moved to the outline of the mask. People move
+smoothly, bend their joints one way only, and have one shape.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from twofold.body.skeleton import Body
+from twofold.errors import TwofoldError
+from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from twofold.prepare.fitting.body_landmarks import body_points
+from twofold.prepare.fitting.energy import PriorWeights, direction_term, landmark_term, match_rims, outline_term, prior
+from twofold.prepare.fitting.observations import Evidence, begin, gather
+from twofold.prepare.fitting.outlines import Outlines, trace_outlines
+from twofold.prepare.fitting.parameters import Chosen, Motion, Posed, choose, pose_motion
+
+WARM_UP = 20
+"""Steps over which the rate grows to its full size."""
+WINDOW, OVERLAP = 240, 24
+"""Moments fitted together, and how many of them two neighbours share."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How hard each kind of evidence pulls. Lengths in the picture count in percent of the person's height there.
+
+    Attributes:
+        steps: of the landmark stage and of the outline stage.
+        rate: Adam's rate at the start, radians and ten centimetres.
+        landmark: error of a landmark, percent; larger ones count ever less.
+        direction: error of a direction in space, as the length of the difference of unit vectors.
+        outline: error of the outline, percent.
+        outline_weight: of the outline against the landmarks.
+        direction_weight: of the landmarks' directions in space in the last stages.
+        prior: what is known about people.
+        rematch: steps after which outline and body are matched anew.
+    """
+
+    steps: tuple[int, int] = (150, 160)
+    rate: float = 0.06
+    landmark: float = 1.2
+    direction: float = 0.35
+    outline: float = 1.0
+    outline_weight: float = 40.0
+    direction_weight: float = 0.3
+    prior: PriorWeights = PriorWeights()
+    rematch: int = 20
+
+
+_Matched = tuple[int, Outlines, Chosen, Tensor]
+
+
+def fit(
+    body: Body,
+    evidence: Sequence[Evidence],
+    fps: float,
+    free_focal: bool = False,
+    config: FitConfig | None = None,
+    points_in_space: Float[np.ndarray, "t 33 3"] | None = None,
+    watch: Callable[[float], None] | None = None,
+) -> Motion:
+    """The body's shape and motion through a clip.
+
+    A long clip is fitted window by window, after shape and focal length were found on a part of it, so that memory
+    does not grow with its length.
+
+    Args:
+        body: of any kind; the shape coefficients that it has are fitted.
+        evidence: of each camera, all of the same moments.
+        fps: moments per second.
+        free_focal: the focal length of the one camera is a guess and is fitted too.
+        config: weights.
+        points_in_space: landmarks triangulated from several cameras, world, metres; NaN where unknown.
+        watch: told the share that is done.
+
+    Raises:
+        TwofoldError: nobody was found at any moment.
+    """
+    threads = torch.get_num_threads()
+    # Thousands of small operations: sharing them out costs more than it saves.
+    torch.set_num_threads(1)
+    try:
+        return _fit(
+            body, evidence, fps, free_focal, config or FitConfig(), points_in_space, watch or (lambda done: None)
+        )
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _fit(
+    body: Body,
+    evidence: Sequence[Evidence],
+    fps: float,
+    free_focal: bool,
+    config: FitConfig,
+    points_in_space: Float[np.ndarray, "t 33 3"] | None,
+    watch: Callable[[float], None],
+) -> Motion:
+    moments = len(evidence[0].track)
+    if not np.any([e.track.found for e in evidence]):
+        raise TwofoldError("Nobody was found in any picture; film one whole person, well lit, and try again.")
+    if moments <= WINDOW + OVERLAP:
+        return _fit_window(body, evidence, fps, free_focal, config, points_in_space, None, watch)
+    starts = list(range(0, moments - OVERLAP, WINDOW))
+    # The window in which most is seen tells shape and focal length best.
+    seen = [sum(float(e[slice(s, s + WINDOW)].track.visibility.sum()) for e in evidence) for s in starts]
+    best = starts[int(np.argmax(seen))]
+    parts: list[Motion] = []
+    first = _window(evidence, points_in_space, slice(best, best + WINDOW + OVERLAP))
+    # Distances told apart from translations would be those of one window only.
+    known = _fit_window(body, first[0], fps, free_focal, config, first[1], None, lambda done: None).settled(body)
+    for number, start in enumerate(starts):
+        some, space = _window(evidence, points_in_space, slice(start, start + WINDOW + OVERLAP))
+        parts.append(
+            known if start == best else _fit_window(body, some, fps, False, config, space, known, lambda done: None)
+        )
+        watch((number + 1) / len(starts))
+    return _joined(parts)
+
+
+def _window(
+    evidence: Sequence[Evidence], space: Float[np.ndarray, "t 33 3"] | None, times: slice
+) -> tuple[list[Evidence], Float[np.ndarray, "u 33 3"] | None]:
+    return [e[times] for e in evidence], None if space is None else space[times]
+
+
+def _joined(parts: Sequence[Motion]) -> Motion:
+    """Windows one after the other; where two overlap, the one fades into the other."""
+    whole = parts[0]
+    for part in parts[1:]:
+        shared = min(OVERLAP, len(part))
+        fade = torch.linspace(0, 1, shared + 2)[1:-1, None]
+        # The second window's turn is told on top of the first one's guess, so that both can be mixed.
+        before, after = whole[slice(len(whole) - shared, len(whole))], part[slice(0, shared)]
+        again = _on_guess(after, before.guess)
+        mixed = replace(
+            before,
+            root=before.root + fade * (again.root - before.root),
+            pose=before.pose + fade[..., None] * (after.pose - before.pose),
+            translation=before.translation + fade * (after.translation - before.translation),
+        )
+        pieces = (whole[slice(0, len(whole) - shared)], mixed, part[slice(shared, len(part))])
+        joined = {n: torch.cat([getattr(p, n) for p in pieces]) for n in ("guess", "root", "pose", "translation")}
+        whole = replace(whole, **joined)
+    return whole
+
+
+def _on_guess(motion: Motion, guess: Float[Tensor, "t 3 3"]) -> Motion:
+    turned = axis_angle_to_matrix(motion.root) @ motion.guess @ guess.transpose(1, 2)
+    return replace(motion, guess=guess, root=matrix_to_axis_angle(turned))
+
+
+def _fit_window(
+    body: Body,
+    evidence: Sequence[Evidence],
+    fps: float,
+    free_focal: bool,
+    config: FitConfig,
+    points_in_space: Float[np.ndarray, "t 33 3"] | None,
+    known: Motion | None,
+    watch: Callable[[float], None],
+) -> Motion:
+    points = body_points(body)
+    outlines = [None if e.masks is None else trace_outlines(e.masks) for e in evidence]
+    seen = gather(evidence, outlines, points_in_space)
+    motion = begin(body, points, seen)
+    if known is not None:
+        motion = replace(motion, betas=known.betas, marks=known.marks, log_focal=known.log_focal)
+    shared: tuple[str, ...] = () if known is not None else ("betas", "marks")
+    if known is None and len(evidence) == 1:
+        shared += ("log_distance", "log_focal") if free_focal else ("log_distance",)
+    total = sum(config.steps)
+
+    def everything(direction: float, wide: float) -> Callable[[Motion, Posed], Tensor]:
+        def loss(motion: Motion, posed: Posed) -> Tensor:
+            terms = landmark_term(posed, points, motion, seen, config.landmark * wide)
+            terms = terms + direction * direction_term(posed, points, motion, seen, config.direction)
+            return terms + prior(body, posed, motion, fps, config.prior)
+
+        return loss
+
+    # Directions in space first, so that no limb starts from the wrong side of the picture plane.
+    few = config.steps[0] // 3
+    motion = _descend(body, motion, ("root", "pose", "translation"), everything(1.0, 4.0), few, config.rate)
+    watch(few / total)
+    changing = ("root", "pose", "translation", *shared)
+    for wide in (4.0, 2.0):
+        half = (config.steps[0] - few) // 2
+        motion = _descend(body, motion, changing, everything(config.direction_weight, wide), half, config.rate)
+    watch(config.steps[0] / total)
+    masks = [(k, o) for k, o in enumerate(outlines) if o is not None]
+    rounds = max(1, config.steps[1] // config.rematch) if masks else 0
+    count = len(body.template)
+    searched, skin = (choose(body, torch.arange(0, count, max(1, count // n))) for n in (4500, 450))
+    base = everything(config.direction_weight, 1.0)
+    for number in range(rounds):
+        matched = [(k, o, *match_rims(body, motion, seen, k, o, searched)) for k, o in masks]
+        width = config.outline * (1 + 3 * (1 - number / rounds))
+        rate = config.rate * 0.5 * (1 - number / rounds) + 0.002
+
+        def with_outlines(
+            motion: Motion, posed: Posed, matched: list[_Matched] = matched, width: float = width
+        ) -> Tensor:
+            loss = base(motion, posed)
+            for k, traced, rims, weight in matched:
+                term = outline_term(posed, motion, seen, k, traced, rims, weight, skin, width)
+                loss = loss + config.outline_weight * term
+            return loss
+
+        motion = _descend(body, motion, changing, with_outlines, config.rematch, rate, decay=False)
+        watch((config.steps[0] + (number + 1) * config.rematch) / total)
+    return motion
+
+
+def _descend(
+    body: Body,
+    motion: Motion,
+    changing: tuple[str, ...],
+    loss: Callable[[Motion, Posed], Tensor],
+    steps: int,
+    rate: float,
+    decay: bool = True,
+) -> Motion:
+    """Adam on some of the unknowns.
+
+    Its first steps move every unknown by the whole rate, however small the slope: along an arm that adds up to half a
+    metre, from where robust terms no longer find back. So the rate starts small.
+    """
+    free = {name: getattr(motion, name).clone().requires_grad_() for name in changing}
+    pace = {"translation": 0.5, "betas": 2.0, "marks": 0.05, "log_focal": 0.2, "log_distance": 0.3}
+    groups = [{"params": [value], "lr": rate * pace.get(name, 1.0)} for name, value in free.items()]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    start = [rate * pace.get(name, 1.0) for name in free]
+    for step in range(steps):
+        share = (1 - 0.8 * step / steps if decay else 1.0) * min(1.0, (step + 1) / WARM_UP)
+        for group, first in zip(optimizer.param_groups, start, strict=True):
+            group["lr"] = first * share
+        now = replace(motion, **free)
+        optimizer.zero_grad()
+        loss(now, pose_motion(body, now)).backward()
+        optimizer.step()
+    return replace(motion, **{name: value.detach() for name, value in free.items()})

@@ -1,0 +1,229 @@
+"""The clips that a capture is made from, each with the camera that took it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from twofold.capture.layout import intrinsics_faults
+from twofold.errors import TwofoldError
+from twofold.geometry.cameras import Camera
+from twofold.prepare.cameras.calibration import (
+    CalibratedCamera,
+    for_pictures,
+    largest_distortion,
+    match_cameras,
+    pinhole,
+)
+from twofold.prepare.cameras.calibration_files import read_calibration
+from twofold.prepare.video.frames import ClipInfo, Frames
+
+FOCAL_GUESS = 1.1
+"""Times the longer side of a picture: between a phone's wide lens and a camera's usual one."""
+
+_LENS_MATTERS = 0.5
+"""Pictures are straightened where the lens moves a point by more pixels than this."""
+
+
+@dataclass(frozen=True)
+class PrepareConfig:
+    """What to make of the clips.
+
+    Attributes:
+        fps: pictures a second to use; None for all.
+        max_size: longer side of the pictures, pixels; larger ones are made smaller.
+        intrinsics: fx, fy, cx, cy in pixels of the clip itself; None to find the focal length.
+        calibration: file or folder with the cameras of several clips.
+        train_camera: which clip trains where there are several, by its name; None for the first.
+        held_out: of so many moments one is kept for testing.
+        held_objects: whether balls and the like are taken out of the masks.
+        credit: whom to name when showing the pictures.
+        masks: the user's own, instead of the estimator's.
+        landmarks: likewise.
+        poses: likewise; nothing is fitted then.
+        several_people: whether a second person in view ends it.
+    """
+
+    fps: float | None = None
+    max_size: int = 960
+    intrinsics: tuple[float, float, float, float] | None = None
+    calibration: Path | None = None
+    train_camera: str | None = None
+    held_out: int = 10
+    held_objects: Literal["keep", "remove"] = "remove"
+    credit: str = ""
+    masks: Path | None = None
+    landmarks: Path | None = None
+    poses: Path | None = None
+    several_people: Literal["refuse", "ignore"] = "refuse"
+
+
+_HINTS = {
+    "masks": "is each white on the person of its own picture?",
+    "landmarks": "are they of this clip, in pixels of its full size?",
+    "poses": "are they of this clip and body, in metres and radians, before the camera?",
+    "calibration": "do its cameras' names go with the videos', and is it of this recording?",
+}
+"""What to ask about each piece of the user's own."""
+
+
+def advice(config: PrepareConfig, film: str, pieces: Sequence[str] = tuple(_HINTS)) -> str:
+    """What to do about pictures that are not understood, the end of a sentence.
+
+    Args:
+        config: what was given.
+        film: what to do where nothing was given that could be at fault: then it is the film.
+        pieces: which of the user's own pieces could be at fault.
+    """
+    given = [(piece, getattr(config, piece)) for piece in pieces if getattr(config, piece) is not None]
+    if not given:
+        return film
+    return "the likeliest cause is " + ", or ".join(f"--{piece} {path} ({_HINTS[piece]})" for piece, path in given)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One clip, ready to be looked at.
+
+    Attributes:
+        name: of its camera.
+        path: where it lies.
+        frames: its pictures.
+        info: what will come of it.
+        camera: that took it, for pictures without distortion.
+        lens: how to take the distortion out of a picture; None where there is next to none.
+        calibrated: the camera in the calibration's precision; None where it was guessed.
+    """
+
+    name: str
+    path: Path
+    frames: Frames
+    info: ClipInfo
+    camera: Camera
+    lens: CalibratedCamera | None
+    calibrated: CalibratedCamera | None
+
+
+def read_intrinsics(text: str | None) -> tuple[float, float, float, float] | None:
+    """fx, fy, cx, cy from "fx,fy,cx,cy".
+
+    Raises:
+        TwofoldError: that is not what it says.
+    """
+    if text is None:
+        return None
+    try:
+        fx, fy, cx, cy = (float(part) for part in text.split(","))
+    except ValueError:
+        raise TwofoldError(
+            f"--intrinsics should be four numbers fx,fy,cx,cy in pixels, such as 1050,1050,540,960; it is {text!r}."
+        ) from None
+    _require_lens((fx, fy, cx, cy))
+    return fx, fy, cx, cy
+
+
+def _require_lens(lens: tuple[float, float, float, float]) -> None:
+    if not (np.isfinite(lens).all() and min(lens[:2]) > 0):
+        given = ",".join(f"{number:g}" for number in lens)
+        raise TwofoldError(
+            f"--intrinsics should be finite numbers fx,fy,cx,cy in pixels with fx and fy above 0; they are {given}."
+        )
+
+
+def require_options(clips: Sequence[Path], config: PrepareConfig) -> None:
+    """Refuses options that do not go together.
+
+    Raises:
+        TwofoldError: as it says.
+    """
+    if not clips:
+        raise TwofoldError("Expected at least one video or folder of pictures; none was given.")
+    if len(clips) > 1 and config.calibration is None:
+        raise TwofoldError(
+            f"{len(clips)} videos were given, which need --calibration FILE to say where their cameras stand; "
+            "give one, or prepare a single video."
+        )
+    if config.intrinsics is not None:
+        _require_lens(config.intrinsics)
+        if config.calibration is not None:
+            raise TwofoldError(
+                "--intrinsics and --calibration were both given; the calibration has them, take it alone."
+            )
+    if config.held_out < 3:
+        raise TwofoldError(
+            f"One moment of {config.held_out} cannot be held out between two that train; take 3 or more."
+        )
+
+
+def open_clips(clips: Sequence[Path], config: PrepareConfig) -> list[Clip]:
+    """The clips with their cameras, calibrated or guessed.
+
+    Raises:
+        TwofoldError: a clip or the calibration cannot be read, or they do not go together.
+    """
+    names = [clip.stem if clip.is_file() else clip.name for clip in clips]
+    lenses: list[CalibratedCamera] | None = None
+    if config.calibration is not None:
+        lenses = match_cameras(read_calibration(config.calibration), names)
+    ready: list[Clip] = []
+    for k, (name, clip) in enumerate(zip(names, clips, strict=True)):
+        frames = Frames(clip, config.fps, config.max_size)
+        info = frames.info
+        if lenses is None:
+            ready.append(Clip(_folder_name(name), clip, frames, info, _guessed(info, config), None, None))
+            continue
+        lens = for_pictures(lenses[k], next(iter(Frames(clip, config.fps))).image)
+        small = _smaller(lens, info)
+        straight = largest_distortion(small, info.height, info.width) <= _LENS_MATTERS
+        camera = small.without_distortion()
+        seen = pinhole(camera, info.height, info.width)
+        ready.append(Clip(_folder_name(name), clip, frames, info, seen, None if straight else small, camera))
+    rates = {round(clip.info.fps, 2) for clip in ready}
+    if len(rates) > 1:
+        words = ", ".join(f"{clip.name} {clip.info.fps:.4g}" for clip in ready)
+        raise TwofoldError(f"The videos have different frame rates ({words}); give one that all reach with --fps.")
+    return ready
+
+
+def _folder_name(name: str) -> str:
+    """A camera's name out of a file's: letters, digits, '_', '-' and '.' only."""
+    kept = "".join(c if c.isascii() and (c.isalnum() or c in "_-.") else "_" for c in name).lstrip("-.")
+    return kept or "cam"
+
+
+def _guessed(info: ClipInfo, config: PrepareConfig) -> Camera:
+    """A camera at the world's origin.
+
+    Raises:
+        TwofoldError: the lens that was given belongs to no picture of this size.
+    """
+    across, down = info.width / info.full_width, info.height / info.full_height
+    if config.intrinsics is None:
+        fx = fy = FOCAL_GUESS * max(info.width, info.height)
+        cx, cy = (info.width - 1) / 2, (info.height - 1) / 2
+    else:
+        fx, fy, cx, cy = config.intrinsics
+        faults = intrinsics_faults(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), info.full_width)
+        if faults:
+            raise TwofoldError(f"--intrinsics {fx:g},{fy:g},{cx:g},{cy:g} do not go with the video: {faults[0]}")
+        fx, fy, cx, cy = fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
+    return Camera(torch.eye(4), torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), info.height, info.width)
+
+
+def _smaller(lens: CalibratedCamera, info: ClipInfo) -> CalibratedCamera:
+    """The lens as it is in the smaller pictures; distortion does not change with the size."""
+    scale = np.array([info.width / info.full_width, info.height / info.full_height])
+    intrinsics = lens.intrinsics.copy()
+    intrinsics[:2] *= scale[:, None]
+    intrinsics[:2, 2] += 0.5 * (scale - 1)
+    return replace(lens, intrinsics=intrinsics, height=info.height, width=info.width)
+
+
+def longer(camera: Camera, factor: float) -> Camera:
+    """The camera with another focal length."""
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[0, 0], intrinsics[1, 1] = intrinsics[0, 0] * factor, intrinsics[1, 1] * factor
+    return Camera(camera.world_to_camera, intrinsics, camera.height, camera.width)

@@ -1,0 +1,90 @@
+"""A recipe: all that decides a run beside its capture. Configuration only."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from twofold.config import MOST_SEED, require_within
+
+
+@dataclass(frozen=True)
+class PixelConfig:
+    """How the rays of a step are chosen from a picture."""
+
+    rays: int = 576
+    """Single pixels, from the subject's box and around it."""
+    subject_share: float = 0.7
+    """Share of these that come from the subject's surroundings; the rest from all of the posed body's box."""
+    surroundings: int | None = None
+    """Surroundings are pixels at most this far from the mask; none: the mask's bounding box, as released."""
+    patches: int = 2
+    """Square patches, whose pixels also go to the perceptual loss."""
+    patch_size: int = 24
+    """Edge of a patch, pixels."""
+    patch_on_subject: float = 0.9
+    """Probability that a patch is centred on the subject."""
+
+    def __post_init__(self) -> None:
+        """Refuses choices with which no picture gives pixels, or more than any machine takes."""
+        require_within(
+            self, rays=(1, 1_000_000), subject_share=(0, 1), surroundings=(0, 10_000), patches=(0, 1000),
+            patch_size=(1, 1024), patch_on_subject=(0, 1),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How an avatar is trained; the defaults are the authors' release."""
+
+    steps: int = 200_000
+    images_per_step: int = 2
+    """Pictures whose gradients are averaged; each of N processes takes an N-th of them."""
+    pixels: PixelConfig = PixelConfig()
+    rate_low: float = 5e-4
+    rate_high: float = 2e-4
+    rate_grid: float = 1e-2
+    rate_beta: float = 1e-4
+    rate_pose: float = 5e-5
+    milestones: tuple[int, ...] = (200, 400)
+    """Epochs after which the rates are halved; an epoch sees every training picture once."""
+    warmup: int = 0
+    """Steps over which the rates rise from zero."""
+    decay: float = 1.0
+    """What the rates are multiplied with in the end, approached exponentially after `decay_from`; 1 for no decay."""
+    decay_from: float = 0.3
+    """Share of the steps before that decay begins."""
+    adam_betas: tuple[float, float] = (0.9, 0.999)
+    adam_epsilon: float = 1e-8
+    clip: float = 1.0
+    """Largest global norm of the gradient; 0 for no limit."""
+    checkpoint_every: int = 500
+    preview_every: int = 1000
+    """Steps between two preview pictures; 0 for none."""
+    compile: Literal["never", "auto", "always"] = "never"
+    """Whether dense networks run compiled (torch.compile): "auto" on a GPU only. The first step then takes minutes."""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers with which nothing can be trained."""
+        most = 100_000_000
+        rates = {name: (0, 1000) for name in vars(self) if name.startswith("rate_")}
+        require_within(
+            self, steps=(1, most), images_per_step=(1, 1000), checkpoint_every=(1, most), preview_every=(0, most),
+            warmup=(0, most), milestones=(0, most), decay=(1e-9, 1), decay_from=(0, 1), clip=(0, 1e6),
+            adam_epsilon=(0, 1), **rates,
+        )  # fmt: skip
+        if not all(0 <= beta < 1 for beta in self.adam_betas):
+            raise ValueError(f"adam_betas={self.adam_betas} should lie in 0..1, below 1")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """All that decides a run beside its capture."""
+
+    name: str
+    method: Any
+    """A method's configuration: a `MethodConfig` of `twofold.methods.base`. `recipe_from_dict` reads it by its kind."""
+    training: TrainingConfig = TrainingConfig()
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuses seeds that not every generator takes."""
+        require_within(self, seed=(0, MOST_SEED))

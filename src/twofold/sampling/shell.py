@@ -1,0 +1,173 @@
+"""The shell: the part of space close to a posed body, as a voxel list that knows each voxel's nearest vertices.
+
+The body is the prior of everything here. A ray is sampled only where it runs through the shell, and the nearest vertex
+of a sample is sought only among the few that its voxel lists, instead of among all of them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import ndimage
+from torch import Tensor
+
+from twofold.geometry.cameras import Rays, clip_to_box
+from twofold.kernels.kdtree import search_tree
+from twofold.kernels.parallel import in_parts
+from twofold.sampling import shell_kernels
+from twofold.volume.samples import Samples
+
+
+@dataclass(frozen=True)
+class Shell:
+    """Voxels within `radius` of a body's vertices.
+
+    Attributes:
+        low: corner of the voxel grid, metres.
+        voxel: edge of a voxel, metres.
+        radius: distance to the nearest vertex that still counts as inside the shell, metres.
+        row: for each voxel of the grid the row of `nearest` that belongs to it; outside the shell -k, where no voxel of
+            the shell is closer than k - 1 voxels.
+        nearest: the vertices nearest to each listed voxel's centre, nearest first.
+        vertices: the body's vertices, metres.
+    """
+
+    low: Float[Tensor, "3"]
+    voxel: float
+    radius: float
+    row: Int[Tensor, "X Y Z"]
+    nearest: Int[Tensor, "N C"]
+    vertices: Float[Tensor, "V 3"]
+
+    @property
+    def high(self) -> Float[Tensor, "3"]:
+        """The corner opposite to `low`, metres."""
+        size = torch.tensor(self.row.shape, dtype=self.low.dtype, device=self.low.device)
+        return self.low + self.voxel * size
+
+    def rows_at(self, points: Float[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
+        """Row of the voxel that each point lies in, or a negative number."""
+        cell = ((points - self.low) * (1 / self.voxel)).floor()
+        x, y, z = self.row.shape
+        flat = (cell[..., 0] * y + cell[..., 1]) * z + cell[..., 2]
+        # Points outside the grid are rare: rays are clipped to it first. A flat index in range may still lie outside.
+        inside = (cell >= 0).all(-1) & (cell[..., 0] < x) & (cell[..., 1] < y) & (cell[..., 2] < z)
+        return torch.where(inside, self.row.flatten()[torch.where(inside, flat, 0).long()], -1).long()
+
+
+def build_shell(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], radius: float, voxel: float, candidates: int = 6
+) -> Shell:
+    """Lists the voxels within `radius` of the vertices, and for each the vertices that may be nearest in it.
+
+    Args:
+        vertices: posed (or canonical) vertices, metres.
+        faces: triangles; their centres count as surface too, for bodies with large triangles.
+        radius: metres.
+        voxel: metres.
+        candidates: how many vertices a voxel lists.
+    """
+    points = vertices.detach().cpu().numpy().astype(np.float32)
+    surface = np.concatenate([points, points[faces.cpu().numpy()].mean(1)])
+    low = surface.min(0) - radius - 2 * voxel
+    shape = np.ceil((surface.max(0) + radius + 2 * voxel - low) / voxel).astype(int)
+    seeds = np.ones(shape, dtype=bool)
+    seeds[tuple(((surface - low) / voxel).astype(int).T)] = False
+    # A voxel is off the surface's own voxel by at most one diagonal, so this keeps a superset of the true shell.
+    away = np.asarray(ndimage.distance_transform_edt(seeds))
+    reach = radius / voxel + np.sqrt(3)
+    near = np.argwhere(away <= reach)
+    centers = (low + (near + 0.5) * voxel).astype(np.float32)
+    tree = search_tree(points, quick=True)
+    listed = min(candidates, len(points))
+    distance, nearest = (np.reshape(a, (-1, listed)) for a in tree.query(centers, k=listed, workers=-1))
+    keep = distance[:, 0] <= radius + np.sqrt(3) / 2 * voxel
+    row = -1 - np.maximum(away - reach, 0).astype(np.int32)
+    row[tuple(near[keep].T)] = np.arange(keep.sum(), dtype=np.int32)
+    device = vertices.device
+    return Shell(
+        low=torch.as_tensor(low, device=device),
+        voxel=voxel,
+        radius=radius,
+        row=torch.as_tensor(row, device=device),
+        nearest=torch.as_tensor(nearest[keep].astype(np.int32), device=device),
+        vertices=vertices.detach().float(),
+    )
+
+
+def nearest_listed(
+    shell: Shell, points: Float[Tensor, "S 3"], rows: Int[Tensor, "S"], k: int
+) -> tuple[Int[Tensor, "S k"], Float[Tensor, "S k"]]:
+    """The k nearest vertices of points in the shell and their squared distances (metres squared), nearest first.
+
+    Sought among the candidates of each point's voxel, so some are missed where vertices lie denser than voxels.
+    Around an Anny body (14,000 vertices, voxels of 2 cm) the nearest one found is 0.6 mm too far on average with six
+    candidates, 0.3 mm with twelve.
+    """
+    listed = shell.nearest[rows].long()
+    offsets = shell.vertices[listed] - points[:, None]
+    squared = (offsets * offsets).sum(-1)
+    if k == 1:
+        best, which = squared.min(-1, keepdim=True)
+    else:
+        best, which = squared.topk(k, -1, largest=False)
+    return listed.gather(1, which), best
+
+
+def sample_shell(
+    shell: Shell, rays: Rays, step: float, generator: torch.Generator | None, limit: float
+) -> tuple[Samples, Int[Tensor, "S 1"], Float[Tensor, "S 1"]]:
+    """Samples every `step` metres along each ray, kept only within `limit` of the body.
+
+    Args:
+        shell: where to sample.
+        rays: their near and far bounds are respected.
+        step: metres.
+        generator: moves each ray's comb of samples by a random part of a step; None puts samples at mid-step.
+        limit: largest distance to the nearest vertex, metres, at most the shell's radius.
+
+    Returns:
+        packed samples, the nearest vertex of each, and its squared distance (metres squared).
+    """
+    clipped, hit = clip_to_box(rays, shell.low, shell.high)
+    ray_ids = hit.nonzero()[:, 0]
+    device = rays.origins.device
+    start = torch.full_like(rays.near, 0.5)
+    if generator is not None:
+        start = torch.rand(len(rays), generator=generator, device=generator.device).to(device)
+    clipped, start = clipped[ray_ids], start[ray_ids]
+    if len(ray_ids) == 0:
+        none = torch.zeros(0, device=device)
+        return Samples(ray_ids, none, none), ray_ids[:, None], none[:, None]
+    find = _walk_in_torch if device.type != "cpu" or rays.origins.dtype != torch.float32 else _walk_compiled
+    ray, depth, nearest, squared = find(shell, clipped, start, step, limit)
+    samples = Samples(ray_ids[ray], depth, torch.full_like(depth, step))
+    return samples, nearest[:, None], squared[:, None]
+
+
+def _walk_compiled(
+    shell: Shell, rays: Rays, start: Tensor, step: float, limit: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    arrays = (t.contiguous().numpy() for t in (rays.origins, rays.directions, rays.near, rays.far, start))
+    origins, directions, near, far, first = arrays
+    given = (origins, directions, near, far, first, np.float32(step), shell.low.numpy(), shell.voxel, shell.row.numpy())
+    more = (shell.nearest.numpy(), shell.vertices.numpy(), limit)
+    parts = in_parts(len(rays), lambda begin, end: shell_kernels.walk(*given, *more, begin, end), least=64)
+    ray, depth, nearest, squared = (torch.from_numpy(np.concatenate(part)) for part in zip(*parts, strict=True))  # type: ignore[misc]
+    return ray, depth, nearest, squared
+
+
+def _walk_in_torch(
+    shell: Shell, rays: Rays, start: Tensor, step: float, limit: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The same as `_walk_compiled`, for GPUs and as its slow twin."""
+    longest = int(((rays.far - rays.near) / step).max().ceil())
+    steps = torch.arange(longest, device=rays.near.device, dtype=rays.near.dtype)
+    depth = rays.near[:, None] + step * (steps + start[:, None])
+    points = rays.origins[:, None] + depth[..., None] * rays.directions[:, None]
+    rows = shell.rows_at(points)
+    ray, position = ((rows >= 0) & (depth < rays.far[:, None])).nonzero(as_tuple=True)
+    nearest, squared = nearest_listed(shell, points[ray, position], rows[ray, position], 1)
+    close = squared[:, 0] < limit**2
+    return ray[close], depth[ray, position][close], nearest[close, 0], squared[close, 0]

@@ -1,0 +1,38 @@
+"""Every recipe and every ablation, shrunk until a step takes milliseconds."""
+
+from dataclasses import replace
+
+from tiny_person import tiny_recipe
+
+from twofold.field.factorized import FactorizedFieldConfig
+from twofold.methods.factorized_recipes import ABLATIONS, ablation
+from twofold.methods.table import RECIPES
+from twofold.recipe import Recipe
+from twofold.sampling.error_bounded import ErrorBoundedSampler
+
+LATE = 20_006
+"""A step at which every schedule has begun and, of five moments, no zero pose is shown."""
+
+
+def shrunk(recipe: Recipe) -> Recipe:
+    """The same switches with smaller networks and fewer samples."""
+    if recipe.name.startswith("quick"):
+        return replace(tiny_recipe(), name=recipe.name)
+    method = recipe.method
+    assert isinstance(method.field, FactorizedFieldConfig)
+    # In float32, so that tolerances hold whatever the hardware is good at; `field` tests the other types.
+    field = replace(method.field, width=72, high_sdf_depth=4, high_color_depth=2, hidden_dtype="float32")
+    if isinstance(method.sampler, ErrorBoundedSampler):
+        sampler = replace(method.sampler, refined=24, shaded=12, extra=6, rounds=2)
+    else:
+        sampler = replace(method.sampler, step=0.02, voxel=0.03)
+    losses = replace(method.losses, eikonal_points=32)
+    pixels = replace(recipe.training.pixels, rays=64, patches=1, patch_size=16)
+    method = replace(method, field=field, sampler=sampler, losses=losses)
+    return replace(recipe, method=method, training=replace(recipe.training, pixels=pixels))
+
+
+CASES: dict[str, Recipe] = {name: shrunk(recipe()) for name, recipe in RECIPES.items()}
+for start in ("quick", "fast"):
+    CASES |= {f"{start} {name}": ablation(name, CASES[start]) for name in ABLATIONS}
+CASES |= {f"fast {name}": ablation(name, CASES["fast"]) for name in ("[8]", "[6,8]")}

@@ -1,0 +1,59 @@
+"""A range cut into parts: nothing twice, nothing left out, in order."""
+
+import threading
+from functools import wraps
+from itertools import chain
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from twofold.kernels.parallel import compiled, in_parts
+
+
+@pytest.fixture(params=[1, 3])
+def threads(request, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: request.param)
+    return request.param
+
+
+@given(count=st.integers(0, 5000), least=st.integers(0, 2000), allowed=st.integers(1, 4))
+def test_parts_cover_the_range_once_and_in_order(count, least, allowed):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch, "get_num_threads", lambda: allowed)
+        parts = in_parts(count, lambda begin, end: (begin, end), least)
+    assert list(chain.from_iterable(range(*part) for part in parts)) == list(range(count))
+    assert 1 <= len(parts) <= allowed
+    assert len(parts) == 1 or min(end - begin for begin, end in parts) >= least
+
+
+def test_parts_run_side_by_side(threads):
+    everyone = threading.Barrier(threads, timeout=20)
+    assert sorted(in_parts(threads, lambda begin, end: (everyone.wait(), begin)[1], least=1)) == list(range(threads))
+
+
+def test_an_error_in_a_part_is_raised(threads):
+    def work(begin, end):
+        if end == 10:
+            raise ValueError("the last part")
+
+    with pytest.raises(ValueError, match="the last part"):
+        in_parts(10, work, least=1)
+
+
+def test_a_compiled_loop_is_the_plain_one_even_if_something_wraps_it():
+    def total(values):
+        out = 0.0
+        for i in range(len(values)):
+            out += values[i]
+        return out
+
+    @wraps(total)
+    def checked(values):
+        raise AssertionError("the check was compiled")
+
+    # Without the copy on disk, whose place the test's own file would have to give.
+    values = np.arange(5.0)
+    assert compiled(checked)(values) == total(values) == 10

@@ -1,0 +1,247 @@
+"""Which pictures are bad, which clips cannot work, and what a user is told."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from acting import standing_camera
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from twofold.errors import TwofoldError
+from twofold.geometry.cameras import Camera
+from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from twofold.prepare.detect.background import background_shift
+from twofold.prepare.detections import LANDMARKS, Track
+from twofold.prepare.output.acceptance import (
+    LEAST_IOU,
+    LEAST_PICTURES,
+    LEAST_VISIBILITY,
+    MOST_REPROJECTION,
+    PictureQuality,
+    kept_times,
+    picture_quality,
+    require_length,
+    require_person,
+    require_whole,
+    warnings_about,
+    yaw_range,
+)
+
+CAMERA = standing_camera()
+GOOD = PictureQuality("cam", 0, 0.9, 1.0, 1.0, 0.9, False)
+
+
+def judged(iou=0.9, error=1.0, visibility=0.9, height=150.0, alone=True, **changes):
+    """The record of a picture whose landmarks are all `error` pixels off."""
+    shown = np.random.default_rng(0).uniform(20, 140, (33, 2))
+    arrays = {"pixels": shown + np.array([0.6, 0.8]) * error, "visibility": np.full(33, visibility)} | changes
+    return picture_quality("cam", CAMERA, 7, iou, shown, height=height, alone=alone, **arrays)
+
+
+def test_a_good_picture_has_no_fault():
+    quality = judged(error=3.0)
+    assert quality == replace(quality, camera="cam", time=7, fault="", cropped=False)
+    assert quality.reprojection == pytest.approx(3)
+    assert quality.reprojection_percent == pytest.approx(2)
+    assert quality.visibility == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"iou": LEAST_IOU - 0.01}, "does not cover the mask (IoU 0.69, at least 0.7)"),
+        ({"error": 1.01 * MOST_REPROJECTION * 1.5}, "misses the landmarks (4.0 % of its height, at most 4 %)"),
+        ({"visibility": LEAST_VISIBILITY - 0.01}, "too little of the person is seen (visibility 0.49, at least 0.5)"),
+        ({"pixels": np.full((33, 2), np.nan)}, "nobody was found"),
+    ],
+)
+def test_bad_pictures_say_why(changes, words):
+    assert words in judged(**changes).fault
+
+
+def test_at_the_thresholds_pictures_stay():
+    assert not judged(iou=LEAST_IOU).fault
+    assert not judged(error=0.99 * MOST_REPROJECTION * 1.5).fault
+    assert not judged(visibility=LEAST_VISIBILITY + 0.01).fault
+
+
+def test_where_other_cameras_see_the_person_landmarks_may_be_missed():
+    assert not judged(error=50.0, alone=False).fault
+    assert "mask" in judged(error=50.0, iou=0.5, alone=False).fault
+
+
+def test_only_landmarks_that_are_seen_are_measured():
+    shown = np.zeros((33, 2)) + 50
+    pixels, visibility = shown + np.array([3.0, 4.0]), np.full(33, 0.9)
+    visibility[:5], pixels[:5] = 0.4, 1000
+    pixels[5:9] = np.nan
+    quality = picture_quality("cam", CAMERA, 0, 0.9, shown, pixels, visibility, 100.0)
+    assert quality.reprojection == pytest.approx(5)
+
+
+@pytest.mark.parametrize("pixels", [np.full((33, 2), np.nan), np.full((33, 2), 50.0)])
+def test_rows_can_be_stored_whatever_was_seen(pixels):
+    quality = judged(pixels=pixels, visibility=np.full(33, 0.1))
+    assert math.isinf(quality.reprojection)
+    row = json.loads(json.dumps(quality.row(), allow_nan=False))
+    assert row["reprojection"] is None
+    assert row["fault"] == quality.fault
+    assert judged(iou=0.87654).row()["iou"] == 0.877
+
+
+@pytest.mark.parametrize("name", ["nose", "left_ankle", "right_wrist"])
+@pytest.mark.parametrize(("place", "cropped"), [((-3, 50), True), ((50, 203), True), ((-0.5, 199.5), False)])
+def test_ends_beyond_the_edge_make_a_picture_cropped(name, place, cropped):
+    pixels = np.full((33, 2), 50.0)
+    pixels[LANDMARKS.index(name)] = place
+    assert judged(pixels=pixels).cropped is cropped
+    pixels[:] = 50
+    pixels[LANDMARKS.index("left_hip")] = place
+    assert not judged(pixels=pixels).cropped
+
+
+def test_short_clips_are_refused():
+    require_length(LEAST_PICTURES, "a.mp4")
+    with pytest.raises(TwofoldError, match=r"a.mp4 has 3 pictures, expected at least 12"):
+        require_length(3, "a.mp4")
+
+
+def track(found):
+    visibility = np.repeat(np.array(found, dtype=float)[:, None], 33, 1)
+    return Track(np.zeros((len(found), 33, 2)), visibility, np.zeros((len(found), 33, 3)))
+
+
+def test_clips_without_a_person_are_refused():
+    require_person(track([1] * 7 + [0] * 3), "a.mp4")
+    with pytest.raises(TwofoldError, match=r"a.mp4 shows a person in only 60 % of the pictures"):
+        require_person(track([1] * 6 + [0] * 4), "a.mp4")
+    with pytest.raises(TwofoldError, match=r"a.mp4 shows nobody; film one whole person"):
+        require_person(track([0] * 5), "a.mp4")
+
+
+def test_clips_that_cut_the_person_off_are_refused():
+    half = [replace(GOOD, cropped=k % 2 == 0) for k in range(10)]
+    require_whole(half, "a.mp4")
+    with pytest.raises(TwofoldError, match=r"In 55 % of the pictures of a.mp4 head, hands or feet"):
+        require_whole([*half, replace(GOOD, cropped=True)], "a.mp4")
+
+
+def records(faults, moments=20, cameras=("a", "b")):
+    """Records of all pictures, with faults by (camera, time)."""
+    return [
+        replace(GOOD, camera=camera, time=time, fault=faults.get((camera, time), ""))
+        for camera in cameras
+        for time in range(moments)
+    ]
+
+
+def test_moments_that_any_camera_shows_badly_are_left_out():
+    faults = {("a", 3): "x", ("b", 3): "y", ("b", 7): "z"}
+    assert kept_times(records(faults), "clip") == [t for t in range(20) if t not in (3, 7)]
+
+
+@given(bad=st.integers(0, 20))
+def test_more_than_three_in_ten_bad_moments_are_too_many(bad):
+    faults = {("a", 19 - k): f"reason {19 - k}" for k in range(bad)}
+    if bad <= 6:
+        assert len(kept_times(records(faults), "clip")) == 20 - bad
+        return
+    with pytest.raises(TwofoldError) as error:
+        kept_times(records(faults), "clip")
+    span = f"{20 - bad}-19"
+    assert f"{bad} of 20 pictures of clip could not be understood (moments {span})" in str(error.value)
+    assert f"at {20 - bad}, for one, reason {20 - bad}; film one person" in str(error.value)
+
+
+def facing(angles, tilt=(0.0, 0.0, 0.0), camera=CAMERA):
+    """Poses that face these angles (radians) about the upright axis, and the camera, in a world that is tilted."""
+    root = torch.zeros(len(angles), 3, dtype=torch.float64)
+    root[:, 1] = torch.as_tensor(angles)
+    world = axis_angle_to_matrix(torch.tensor(tilt, dtype=torch.float64))
+    pose = torch.zeros(len(angles), 24, 3)
+    pose[:, 0] = matrix_to_axis_angle(world @ axis_angle_to_matrix(root)).float()
+    view = camera.world_to_camera.clone()
+    view[:3, :3] = view[:3, :3] @ world.T.float()
+    return pose, Camera(view, camera.intrinsics, camera.height, camera.width)
+
+
+@given(
+    start=st.floats(-10, 10), span=st.floats(0, 6.0), count=st.integers(20, 60),
+    tilt=st.tuples(*[st.floats(-3, 3)] * 3), azimuth=st.floats(-3, 3),
+)  # fmt: skip
+def test_yaw_is_the_arc_that_the_body_turns_through(start, span, count, tilt, azimuth):
+    """Wherever the arc begins, however the world is turned, and in whichever order."""
+    step = span / (count - 1)
+    assume(2 * math.pi - span > step)
+    angles = np.random.default_rng(count).permutation(start + np.linspace(0, span, count))
+    found = yaw_range(*facing(angles, tilt, standing_camera(azimuth)))
+    assert found == pytest.approx(math.degrees(span), abs=0.1)
+
+
+def test_yaw_of_a_full_turn_is_a_full_circle_but_for_one_step():
+    assert yaw_range(*facing(np.arange(36) * 2 * np.pi / 36)) == pytest.approx(350, abs=0.1)
+    assert yaw_range(*facing(np.arange(72) * 2 * np.pi / 36)) == pytest.approx(350, abs=0.1)
+
+
+def test_yaw_of_somebody_who_stands_still_is_nothing():
+    assert yaw_range(*facing([1.0] * 5)) == pytest.approx(0, abs=0.1)
+    assert yaw_range(*facing([0.3])) == pytest.approx(0, abs=0.1)
+
+
+def test_leaning_is_no_turning():
+    pose, camera = facing([0.0] * 9)
+    pose[:, 0, 0] = torch.linspace(-0.5, 0.5, 9)
+    assert yaw_range(pose, camera) < 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, []),
+        ({"yaw": 90.0}, ["only 90 degrees"]),
+        ({"moved": 8.0}, ["background moves by up to 8 pixels"]),
+        ({"moved": 8.0, "several": True}, ["--set training.rate_pose=1e-4"]),
+        ({"moved": 6.0}, []),
+        ({"dropped": [3, 4, 9]}, ["3 moments were left out: 3-4, 9."]),
+        ({"yaw": 10.0, "moved": 30.0, "dropped": [0]}, ["only 10 degrees", "moves by up to 30", "1 moments"]),
+    ],
+)
+def test_warnings_say_what_to_know(changes, words):
+    given = {"yaw": 350.0, "moved": 0.0, "width": 640, "dropped": [], "several": False} | changes
+    found = warnings_about(**given)
+    assert len(found) == len(words)
+    assert all(word in sentence for word, sentence in zip(words, found, strict=True))
+
+
+def wall(seed=0, height=90, width=160):
+    """A background with something to see on it, larger than the picture by 20 pixels on each side."""
+    rng = np.random.default_rng(seed)
+    noise = ndimage.gaussian_filter(rng.standard_normal((height + 40, width + 40)), 2)
+    return (0.5 + 0.15 * noise / noise.std()).clip(0, 1).astype(np.float32)
+
+
+def picture(background, across=0, down=0, person=40, seed=1):
+    """What a camera sees of that wall, with a person of noise before it; and where the person is."""
+    image = background[20 + down : -20 + down or None, 20 + across : -20 + across or None].copy()
+    mask = np.zeros(image.shape, bool)
+    mask[20:80, person : person + 25] = True
+    image[mask] = np.random.default_rng(seed).random(int(mask.sum()))
+    return image, mask
+
+
+@given(across=st.integers(-12, 12), down=st.integers(-8, 8), person=st.integers(10, 110), seed=st.integers(0, 99))
+def test_a_background_that_moves_is_noticed_whatever_the_person_does(across, down, person, seed):
+    first, _ = picture(wall(seed))
+    now, mask = picture(wall(seed), across, down, person, seed=2)
+    assert background_shift(first, now, mask) == pytest.approx(math.hypot(across, down), abs=0.5)
+
+
+def test_pictures_without_a_background_say_nothing():
+    first, mask = picture(wall())
+    assert background_shift(first, np.full_like(first, 0.3), mask) == 0
+    assert background_shift(first, picture(wall(), 8)[0], np.ones_like(mask)) == 0

@@ -1,0 +1,59 @@
+"""A table of distances never claims more than it knows."""
+
+import pytest
+import torch
+from little_body import ball
+
+from twofold.sampling.sdf_grid import tabulate
+
+POINTS = torch.from_numpy(ball()[0])
+CENTER, RADIUS = POINTS.mean(0), float((POINTS - POINTS.mean(0)).norm(dim=1).mean())
+
+
+def sphere(x):
+    return (x - CENTER).norm(dim=-1) - RADIUS
+
+
+def rippled(x):
+    """A centimetre of detail, finer than the lattice can hold."""
+    return sphere(x) + 0.01 * torch.sin(x * 700).prod(-1)
+
+
+def around(count, spread, generator):
+    return POINTS[torch.randint(len(POINTS), (count,), generator=generator)] + spread * torch.randn(
+        count, 3, generator=generator
+    )
+
+
+@pytest.mark.parametrize(("field", "least", "most"), [(sphere, 0.0, 0.004), (rippled, 0.003, 0.04)])
+def test_the_field_lies_between_the_bounds(field, least, most, device, generator):
+    table = tabulate(lambda x: field(x.cpu()).to(device), POINTS.to(device), 0.02, 0.06)
+    assert least < table.doubt < most
+    x = around(20_000, 0.02, generator)
+    nearer, further = (bound.cpu() for bound in table.bounds(x.to(device)))
+    between = (nearer <= field(x)) & (field(x) <= further)
+    assert between.float().mean() > 0.999
+    known = nearer.isfinite()
+    assert known.float().mean() > 0.95
+    torch.testing.assert_close((further - nearer)[known], torch.full((int(known.sum()),), 2 * table.doubt))
+
+
+def test_away_from_the_lattice_nothing_is_known():
+    table = tabulate(sphere, POINTS, 0.02, 0.06)
+    nearer, further = table.bounds(torch.stack([CENTER, CENTER + 10, CENTER - 3]))
+    assert (nearer == -torch.inf).all()
+    assert (further == torch.inf).all()
+
+
+def test_every_node_is_asked_once_in_portions():
+    asked = []
+    table = tabulate(lambda x: asked.append(len(x)) or sphere(x), POINTS, 0.04, 0.06, chunk=100, trials=7)
+    assert max(asked) == 100
+    assert sum(asked) == len(table) + 7
+
+
+def test_a_field_without_a_surface_is_tabulated_too():
+    table = tabulate(lambda x: torch.full((len(x),), 3.0), POINTS, 0.04, 0.06)
+    nearer, further = table.bounds(POINTS)
+    torch.testing.assert_close(nearer, further)
+    torch.testing.assert_close(nearer, torch.full((len(POINTS),), 3.0))

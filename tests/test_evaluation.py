@@ -1,0 +1,92 @@
+"""What is measured, and what the file says about it."""
+
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import torch
+from little_body import little_body
+from PIL import Image
+
+from twofold import evaluation as evaluate
+from twofold.capture.types import Capture, Frame
+from twofold.deform.pose_refinement import PoseRefinement
+from twofold.geometry.cameras import Camera
+from twofold.methods.base import Avatar
+from twofold.outputs.views import Picture
+from twofold.training.run import load
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Two pictures of a red rectangle 20 x 12; a sixth of the first one's is ignored."""
+    image, mask, layer = (np.zeros(shape, np.uint8) for shape in ((40, 32, 3), (40, 32), (40, 32)))
+    image[10:30, 8:20], mask[10:30, 8:20], layer[10:14, 8:18] = (255, 0, 0), 255, 255
+    for name, pixels in (("image", image), ("mask", mask), ("ignored", layer)):
+        Image.fromarray(pixels).save(tmp_path / f"{name}.png")
+    camera = Camera(torch.eye(4), torch.eye(3), 40, 32)
+    pose, translation = torch.zeros(24, 3), torch.zeros(3)
+    frame = Frame(0, "cam", camera, pose, translation, tmp_path / "image.png", tmp_path / "mask.png")
+    hidden = replace(frame, time=1, ignored_file=tmp_path / "ignored.png")
+    splits = {"train": (frame,), "novel_view": (), "novel_pose": (hidden, replace(frame, time=2))}
+    return Capture("rectangle", tmp_path, little_body(), torch.zeros(0), 10.0, (0.0, 0.0, 0.0), splits)
+
+
+def test_what_is_ignored_spoils_no_figure_and_its_share_is_told(capture, monkeypatch):
+    def drawn(avatar, capture, frame, refined):
+        """The truth, but for what is ignored."""
+        image, mask = evaluate.truth(frame, capture.background)
+        ignored = frame.ignored()
+        color, opacity = torch.where(ignored[..., None], 0.3, image), torch.where(ignored, 0.0, mask)
+        return Picture(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
+
+    monkeypatch.setattr(evaluate, "draw_frame", drawn)
+    avatar = Mock(spec=Avatar)
+    figures = evaluate.measure_split(avatar, capture, "novel_pose")
+    assert (figures["psnr"], figures["silhouette_iou"]) == (100, 1)
+    assert figures["ssim_box"] == pytest.approx(1)
+    assert figures["protocol"]["ignored"].startswith("8.3 % of the box on average")
+    assert "ignored" not in evaluate.measure_split(avatar, capture, "train")["protocol"]
+
+
+def refined_avatar(parts):
+    return Mock(spec=Avatar, refinement=PoseRefinement(torch.tensor([0]), 2, parts))
+
+
+def test_what_refined_poses_change_is_told_before_and_after(capture, monkeypatch):
+    def drawn(avatar, capture, frame, refined):
+        image, mask = evaluate.truth(frame, capture.background)
+        color, opacity = image * (0.9 if refined else 0.5), mask.clone()
+        opacity[:14] *= refined
+        return Picture(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
+
+    monkeypatch.setattr(evaluate, "draw_frame", drawn)
+    figures = evaluate.measure_refinement(refined_avatar(("root", "translation")), capture, 8)
+    told = figures.pop("protocol")
+    assert told.keys() == figures.keys() > {"root", "body", "translation", "shape"}
+    # Colours are rounded to eight bits.
+    gained = figures["train_psnr_box_after"] - figures["train_psnr_box_before"]
+    assert gained == pytest.approx(20 * np.log10(5), abs=0.2)
+    assert (figures["train_silhouette_iou_before"], figures["train_silhouette_iou_after"]) == (pytest.approx(0.8), 1)
+    # Of the two held out, one hides most of what is missing.
+    assert figures["held_out_silhouette_iou_before"] == pytest.approx((0.8 + 192 / 200) / 2)
+    assert "poses of the capture" in told["held_out_psnr_box_before"]
+
+
+def test_without_refinement_there_is_no_before_and_after(capture):
+    figures = evaluate.measure_refinement(refined_avatar(()), capture, 8)
+    assert figures.keys() == {"root", "body", "translation", "shape", "protocol"}
+    assert figures["root"] == figures["shape"] == 0
+
+
+def test_progress_goes_to_the_end_and_no_further(trained, tmp_path):
+    avatar, _ = load(trained.folder)
+    told = []
+    metrics = evaluate.evaluate(avatar, trained.capture, tmp_path, 2, 1, lambda share, what: told.append((share, what)))
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1)
+    assert all(before < 1 for before in shares[:-1])
+    sections = {name for name in metrics if name != "pose_refinement"}
+    assert {what for _, what in told} == sections | {"pose refinement"}

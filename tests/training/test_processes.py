@@ -1,0 +1,121 @@
+"""Several processes that train together do what one does alone."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_person import tiny_recipe
+
+from twofold.capture.types import Capture
+from twofold.config import to_dict
+from twofold.files import write_json
+from twofold.recipe import Recipe
+from twofold.training.curves import Curves
+from twofold.training.loop import train
+from twofold.training.processes import Team, announced
+from twofold.training.run import read_checkpoint
+
+TESTS = str(Path(__file__).resolve().parents[1])
+SCRIPT = """
+import sys, torch
+from pathlib import Path
+from twofold.cli.main import main as cli
+from twofold.capture.folder import read_capture
+from twofold.config import from_dict
+from twofold.inputs import read_json
+from twofold.train import loop
+from twofold.training.run import Recipe
+torch.set_num_threads(1)
+capture, folder, recipe = map(Path, sys.argv[1:])
+chosen = from_dict(Recipe, read_json(recipe), str(recipe))
+def run():
+    loop.train(read_capture(capture), chosen, folder, torch.device("cpu"), (folder / "recipe.json").exists())
+cli.COMMANDS = {"go": run, "stay": run}
+cli.main(["go"])
+"""
+
+
+def together(capture: Capture, recipe: Recipe, folder: Path, size: int = 2) -> "list[subprocess.Popen[str]]":
+    """Starts a team as `torchrun` does, by what it says in the environment."""
+    write_json(folder.parent / "wanted.json", to_dict(recipe))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    shared = {"WORLD_SIZE": str(size), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", SCRIPT, str(capture.folder), str(folder), str(folder.parent / "wanted.json")]
+    return [
+        subprocess.Popen(command, env={**os.environ, **shared, "RANK": str(rank)}, stderr=subprocess.PIPE, text=True)
+        for rank in range(size)
+    ]
+
+
+def ended(team: "list[subprocess.Popen[str]]") -> list[tuple[int, str]]:
+    """Exit codes of a team and what each of its processes said."""
+    said = [process.communicate(timeout=300)[1] for process in team]
+    return [(process.returncode, text) for process, text in zip(team, said, strict=True)]
+
+
+def wait_for(path: Path, team: "list[subprocess.Popen[str]]") -> None:
+    """Until a team has made this file or folder."""
+    while not path.exists():
+        assert all(process.poll() is None for process in team), ended(team)
+        time.sleep(0.1)
+
+
+def last_losses(folder: Path) -> dict[str, float]:
+    curves = Curves(folder, 10**9)
+    curves.close()
+    return curves.rows[-1]
+
+
+def test_without_torchrun_a_process_is_alone() -> None:
+    assert announced() == Team(0, 1)
+    assert Team().leads
+
+
+def test_two_processes_learn_what_one_does(person: Capture, tmp_path: Path) -> None:
+    recipe = tiny_recipe(8, images_per_step=4, clip=0.05)
+    for code, said in ended(together(person, recipe, tmp_path / "two")):
+        assert code == 0, said
+    torch.set_num_threads(1)
+    train(person, recipe, tmp_path / "one", torch.device("cpu"))
+    one, two = (read_checkpoint(tmp_path / name)[0] for name in ("one", "two"))
+    assert one.keys() == two.keys()
+    for name, tensor in one.items():
+        torch.testing.assert_close(two[name], tensor, rtol=1e-5, atol=1e-6, msg=name)
+    assert last_losses(tmp_path / "two") == pytest.approx(last_losses(tmp_path / "one"), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_team_stops_together_when_one_is_asked_to_and_goes_on_together(person: Capture, tmp_path: Path) -> None:
+    recipe = tiny_recipe(400, images_per_step=2, checkpoint_every=1000)
+    team = together(person, recipe, tmp_path / "run")
+    wait_for(tmp_path / "run" / "tensorboard", team)
+    time.sleep(1)
+    team[1].send_signal(signal.SIGINT)
+    assert [code for code, _ in ended(team)] == [130, 130]
+    _, stopped = read_checkpoint(tmp_path / "run")
+    assert 0 < stopped < 400
+    shorter = replace(recipe, training=replace(recipe.training, steps=stopped + 2))
+    assert [code for code, _ in ended(together(person, shorter, tmp_path / "run"))] == [0, 0]
+    train(person, shorter, tmp_path / "one", torch.device("cpu"))
+    one, two = (read_checkpoint(tmp_path / name)[0] for name in ("one", "run"))
+    assert one["avatar.raw_beta"].item() == pytest.approx(two["avatar.raw_beta"].item(), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_process_whose_partner_ends_says_so_in_one_sentence(person: Capture, tmp_path: Path) -> None:
+    recipe = tiny_recipe(400, images_per_step=2, checkpoint_every=1000)
+    team = together(person, recipe, tmp_path / "run")
+    wait_for(tmp_path / "run" / "tensorboard", team)
+    team[1].kill()
+    code, said = ended(team)[0]
+    assert code == 2, said
+    assert said.strip() == "twofold: Another of the processes that train together has ended; what it says is the cause."
