@@ -1,4 +1,4 @@
-"""The rules of the house: floors, equations, shapes, sizes, docstrings."""
+"""The rules of the architecture: layers, equations, shapes, sizes, docstrings."""
 
 import ast
 import functools
@@ -13,10 +13,10 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from twofold.config import to_dict
 from twofold.geometry.cameras import Rays
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.methods.factorized_recipes import paper, released
+from twofold.methods.table import recipe_to_dict
 
 ROOT = Path(__file__).resolve().parents[1]
 CODE = sorted(file for folder in ("src", "tests", "docs/hooks", "benchmarks") for file in (ROOT / folder).rglob("*.py"))
@@ -24,7 +24,9 @@ TEXTS = CODE + [
     file
     for folder in (".", ".ci", "docs", "docs/reference")
     for file in sorted((ROOT / folder).iterdir())
-    if file.is_file() and file.suffix in {".md", ".toml", ".yml", ".yaml", ".txt", ".html", ".css", ""}
+    if file.is_file()
+    and file.name != ".git"
+    and file.suffix in {".md", ".toml", ".yml", ".yaml", ".txt", ".html", ".css", ""}
 ]
 
 
@@ -142,7 +144,7 @@ def test_options_in_the_paper_page_exist():
 
 
 def test_every_difference_of_paper_and_release_is_an_option_in_the_paper_page():
-    first, second = settings_of(to_dict(paper())), settings_of(to_dict(released()))
+    first, second = settings_of(recipe_to_dict(paper())), settings_of(recipe_to_dict(released()))
     different = {key for key in first.keys() | second.keys() if first.get(key) != second.get(key)}
     assert different - {"name"} <= options_in_the_paper_page()
     assert len(different) > 10

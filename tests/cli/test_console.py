@@ -2,7 +2,7 @@
 
 import pytest
 
-from twofold.cli.main import console
+from twofold.cli import console
 
 
 def test_a_line_tells_of_progress_every_tenth_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:

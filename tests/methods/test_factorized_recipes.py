@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from twofold.cli.main import Recipes
-from twofold.config import from_dict, to_dict, with_overrides
+from twofold.config import with_overrides
 from twofold.field.factorized import FactorizedFieldConfig
 from twofold.methods.factorized import FactorizedConfig
 from twofold.methods.factorized_recipes import ABLATIONS, ablation, paper, quick, released
-from twofold.methods.table import RECIPES
+from twofold.methods.table import RECIPES, recipe_from_dict, recipe_to_dict
 from twofold.recipe import Recipe
 
 # As the paper has them: [x,y] are octaves of the two branches, [a] is the detail branch alone.
@@ -51,7 +51,7 @@ SWITCHES = {
 def settings(recipe: Recipe) -> dict[str, object]:
     """Every setting by its dotted key."""
     found: dict[str, object] = {}
-    open_ = [("", to_dict(recipe))]
+    open_ = [("", recipe_to_dict(recipe))]
     while open_:
         prefix, values = open_.pop()
         for key, value in values.items():
@@ -108,7 +108,7 @@ def test_numbers_that_only_the_program_tells_are_the_same_in_both():
 def test_every_recipe_is_called_by_its_name_and_reads_back_from_json(name):
     recipe = RECIPES[name]()
     assert recipe.name == name
-    assert from_dict(Recipe, to_dict(recipe), "here") == recipe
+    assert recipe_from_dict(recipe_to_dict(recipe), "here") == recipe
 
 
 def test_command_line_offers_every_recipe():

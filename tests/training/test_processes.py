@@ -14,8 +14,8 @@ import torch
 from tiny_person import tiny_recipe
 
 from twofold.capture.types import Capture
-from twofold.config import to_dict
 from twofold.files import write_json
+from twofold.methods.table import recipe_to_dict
 from twofold.recipe import Recipe
 from twofold.training.curves import Curves
 from twofold.training.loop import train
@@ -26,15 +26,14 @@ TESTS = str(Path(__file__).resolve().parents[1])
 SCRIPT = """
 import sys, torch
 from pathlib import Path
-from twofold.cli.main import main as cli
+from twofold.cli import main as cli
 from twofold.capture.folder import read_capture
-from twofold.config import from_dict
 from twofold.inputs import read_json
-from twofold.train import loop
-from twofold.training.run import Recipe
+from twofold.methods.table import recipe_from_dict
+from twofold.training import loop
 torch.set_num_threads(1)
 capture, folder, recipe = map(Path, sys.argv[1:])
-chosen = from_dict(Recipe, read_json(recipe), str(recipe))
+chosen = recipe_from_dict(read_json(recipe), str(recipe))
 def run():
     loop.train(read_capture(capture), chosen, folder, torch.device("cpu"), (folder / "recipe.json").exists())
 cli.COMMANDS = {"go": run, "stay": run}
@@ -44,7 +43,7 @@ cli.main(["go"])
 
 def together(capture: Capture, recipe: Recipe, folder: Path, size: int = 2) -> "list[subprocess.Popen[str]]":
     """Starts a team as `torchrun` does, by what it says in the environment."""
-    write_json(folder.parent / "wanted.json", to_dict(recipe))
+    write_json(folder.parent / "wanted.json", recipe_to_dict(recipe))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])

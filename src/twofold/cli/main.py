@@ -52,7 +52,7 @@ def train(
     from twofold.capture.folder import read_capture
     from twofold.capture.validate import require, validate
     from twofold.outputs.gallery import save_preview
-    from twofold.train import loop
+    from twofold.training import loop
     from twofold.training.run import RECIPE, choose_device, find_capture, read_recipe
 
     if resume is None:

@@ -15,6 +15,7 @@ from twofold.errors import TwofoldError
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
 from twofold.npz import are_moderate
+from twofold.sampling.shell import Shell
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """The methods: one line each. Recipes, command-line choices and tests are made from this table."""
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
@@ -10,7 +9,7 @@ from twofold.errors import TwofoldError
 from twofold.methods import factorized_recipes
 from twofold.methods.base import MethodConfig
 from twofold.methods.factorized import FactorizedConfig
-from twofold.recipe import Recipe
+from twofold.recipe import Recipe, TrainingConfig
 
 
 @dataclass(frozen=True)
@@ -32,11 +31,19 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
 """What `--recipe` offers; the first is the default."""
 
 
+@dataclass(frozen=True)
+class _Rest:
+    """A recipe without its method, for reading."""
+
+    name: str
+    training: TrainingConfig = TrainingConfig()
+    seed: int = 0
+
+
 def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
     """A recipe as JSON data; the method's configuration carries the name of its class."""
-    plain = to_dict(dataclasses.replace(recipe, method=None))
-    kind = type(recipe.method).__name__
-    return {**plain, "method": {KIND: kind, **to_dict(recipe.method)}}
+    method = {KIND: type(recipe.method).__name__, **to_dict(recipe.method)}
+    return {"name": recipe.name, "method": method, "training": to_dict(recipe.training), "seed": recipe.seed}
 
 
 def recipe_from_dict(data: object, where: str) -> Recipe:
@@ -60,5 +67,6 @@ def recipe_from_dict(data: object, where: str) -> Recipe:
     kind = settings.pop(KIND, next(iter(classes)))
     if kind not in classes:
         raise TwofoldError(f"method in {where} has the unknown kind {kind!r}; known are {', '.join(classes)}.")
-    rest = from_dict(Recipe, {**whole, "method": None}, where)
-    return dataclasses.replace(rest, method=from_dict(classes[kind], settings, f"method in {where}"))
+    rest = from_dict(_Rest, {name: value for name, value in whole.items() if name != "method"}, where)
+    chosen = from_dict(classes[str(kind)], settings, f"method in {where}")
+    return Recipe(rest.name, chosen, rest.training, rest.seed)

@@ -22,8 +22,10 @@ from twofold.capture.folder import CaptureWriter
 from twofold.capture.layout import IMAGES, MASKS, file_stem, spans
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera, project
+from twofold.geometry.upright import turn_world
 from twofold.images import read_grey, read_rgb
 from twofold.npz import are_moderate, read_npz
+from twofold.prepare.output.held_objects import SeenBody, see_body, usual_colors, without_objects
 
 CAMERA = "cam"
 ARRAYS = "capture.npz"

@@ -21,7 +21,9 @@ from twofold.errors import TwofoldError
 from twofold.files import new_folder, plain_errors, write_atomically, write_json, write_npz
 from twofold.inputs import is_there, read_json, require_file, shown, shown_path
 from twofold.methods.base import Avatar, Subject
+from twofold.methods.table import recipe_from_dict, recipe_to_dict
 from twofold.npz import read_npz
+from twofold.recipe import Recipe
 
 RECIPE, ABOUT, SUBJECT, CHECKPOINT, CURVES = (
     "recipe.json", "run.json", "subject.npz", "checkpoint.safetensors", "curves.csv",

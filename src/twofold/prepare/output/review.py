@@ -22,6 +22,7 @@ from twofold.prepare.fitting.body_landmarks import body_points
 from twofold.prepare.fitting.outlines import open_mask
 from twofold.prepare.fitting.parameters import Motion, Posed, choose, place_points, pose_motion
 from twofold.prepare.output.acceptance import PictureQuality, picture_quality
+from twofold.prepare.output.held_objects import SeenBody, see_body, usual_colors, without_objects
 
 _COLOR_SAMPLE = 120
 """Pictures from which a vertex's usual colour is learned."""
