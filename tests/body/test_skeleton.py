@@ -15,11 +15,13 @@ from twofold.body.skeleton import (
     Body,
     canonical_pose,
     joint_transforms,
+    joint_transforms_of_rotations,
     pose_body,
     shape_body,
     skin,
 )
 from twofold.errors import TwofoldError
+from twofold.geometry.rotations import axis_angle_to_matrix
 
 seeds = st.integers(0, 2**31)
 
@@ -247,3 +249,11 @@ def test_parents_come_before_their_children():
         assert parent < 0 or side not in ("left", "right") or JOINT_NAMES[parent].partition("_")[0] in (
             side, "pelvis", "spine3",
         )  # fmt: skip
+
+
+def test_rotation_matrices_pose_the_joints_as_their_axis_angles_do():
+    generator = torch.Generator().manual_seed(3)
+    joints, pose = torch.rand(24, 3, generator=generator), torch.randn(24, 3, generator=generator)
+    translation = torch.rand(3, generator=generator)
+    matrices = joint_transforms_of_rotations(joints, axis_angle_to_matrix(pose), translation)
+    assert torch.equal(matrices, joint_transforms(joints, pose, translation))

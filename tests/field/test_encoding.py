@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twofold.field.encoding import encoding_pullback, encoding_size, fourier_encoding
+from twofold.field.encoding import encoding_pullback, encoding_size, fourier_encoding, hann_encoding, open_hann_bands
 
 
 def literal_encoding(x, octaves, include_pi):
@@ -53,3 +53,27 @@ def test_pullback_is_itself_differentiable():
         return encoding_pullback(fourier_encoding(x, 2, True), cotangent, True)
 
     assert torch.autograd.gradcheck(pulled, (x, cotangent))
+
+
+def test_rows_of_other_sizes_are_encoded_alike():
+    x = torch.rand(2, 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    encoded = fourier_encoding(x, 3, include_pi=False)
+    expected = torch.cat([x] + [wave(2**k * x) for k in range(3) for wave in (torch.sin, torch.cos)], 1)
+    torch.testing.assert_close(encoded, expected)
+    assert encoded.shape[1] == encoding_size(3, 7)
+
+
+@pytest.mark.parametrize("open_bands", [0.0, 0.3, 2.0, 2.6, 4.0])
+def test_hann_windows_open_one_after_the_other(open_bands):
+    x = torch.rand(5, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    columns = []
+    for k in range(4):
+        window = (1 - math.cos(math.pi * min(max(open_bands - k, 0), 1))) / 2
+        columns += [window * torch.sin(2**k * x), window * torch.cos(2**k * x)]
+    torch.testing.assert_close(hann_encoding(x, 4, open_bands), torch.cat(columns, 1))
+
+
+def test_bands_open_linearly_between_two_steps():
+    assert open_hann_bands(0, 10, 50, 6) == 0
+    assert open_hann_bands(10, 10, 50, 6) == 0
+    assert open_hann_bands(50, 10, 50, 6) == 6

@@ -208,11 +208,18 @@ def joint_transforms(
     The root turns about its own rest joint and `translation` is added afterwards, SMPL's own convention. The result
     acts on points of the T-pose (it is already relative to the rest joints).
     """
+    return joint_transforms_of_rotations(joints, axis_angle_to_matrix(pose), translation)
+
+
+def joint_transforms_of_rotations(
+    joints: Float[Tensor, "24 3"], rotations: Float[Tensor, "*b 24 3 3"], translation: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 24 4 4"]:
+    """`joint_transforms` of a pose given as rotation matrices, root first."""
     rest = joints.unbind()
     above = torch.stack([rest[parent] for parent in PARENTS[1:]])
     offsets = (joints[1:] - above).expand(*translation.shape[:-1], 23, 3)
     offsets = torch.cat([(joints[0] + translation)[..., None, :], offsets], -2)
-    local = rigid_transform(axis_angle_to_matrix(pose), offsets)
+    local = rigid_transform(rotations, offsets)
     chain = [local[..., 0, :, :]]
     for first, end in itertools.pairwise(_GENERATIONS):
         parents = torch.stack([chain[parent] for parent in PARENTS[first:end]], -3)

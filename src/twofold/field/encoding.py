@@ -7,28 +7,28 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def encoding_size(octaves: int) -> int:
-    """Columns that `fourier_encoding` gives for points of space.
+def encoding_size(octaves: int, dimensions: int = 3) -> int:
+    """Columns that `fourier_encoding` gives for points of space, or for rows of `dimensions` numbers.
 
-    >>> encoding_size(5), encoding_size(10)
-    (33, 63)
+    >>> encoding_size(5), encoding_size(10), encoding_size(10, 4)
+    (33, 63, 84)
     """
-    return 3 * (1 + 2 * octaves)
+    return dimensions * (1 + 2 * octaves)
 
 
-def fourier_encoding(x: Float[Tensor, "S 3"], octaves: int, include_pi: bool) -> Float[Tensor, "S C"]:
+def fourier_encoding(x: Float[Tensor, "S d"], octaves: int, include_pi: bool) -> Float[Tensor, "S C"]:
     """The point beside its sines and cosines at doubling frequencies (Eqs. 2, 4).
 
     >>> fourier_encoding(torch.tensor([[0.0, 0.5, 1.0]]), octaves=1, include_pi=True).round(decimals=3).abs()
     tensor([[0.0000, 0.5000, 1.0000, 0.0000, 1.0000, 0.0000, 1.0000, 0.0000, 1.0000]])
 
     Args:
-        x: points, metres.
+        x: points, metres; or rows of any other numbers.
         octaves: number of frequencies, L_ind or L_d in the paper; 0 gives the point alone.
         include_pi: frequencies 2^k pi radians per metre, as printed; otherwise 2^k, as the authors' program has it.
 
     Returns:
-        (x, sin f_0 x, cos f_0 x, ..., sin f_{L-1} x, cos f_{L-1} x), three columns each.
+        (x, sin f_0 x, cos f_0 x, ..., sin f_{L-1} x, cos f_{L-1} x), d columns each.
     """
     angles = x[:, None] * _frequencies(x, octaves, include_pi)
     waves = torch.stack([angles.sin(), angles.cos()], 2)
@@ -57,3 +57,34 @@ def encoding_pullback(
 def _frequencies(like: Tensor, octaves: int, include_pi: bool) -> Float[Tensor, "L 1"]:
     frequencies = 2.0 ** torch.arange(octaves, dtype=like.dtype, device=like.device)[:, None]
     return frequencies * math.pi if include_pi else frequencies
+
+
+def hann_encoding(x: Float[Tensor, "S d"], octaves: int, open_bands: float) -> Float[Tensor, "S C"]:
+    """Sines and cosines at doubling frequencies whose bands open one after the other (HumanNeRF Eq. 9).
+
+    Band k is multiplied by (1 - cos(pi clamp(open_bands - k, 0, 1))) / 2; x itself is not among the columns.
+
+    >>> hann_encoding(torch.zeros(1, 1), octaves=3, open_bands=1.5).round(decimals=2)
+    tensor([[0.0000, 1.0000, 0.0000, 0.5000, 0.0000, 0.0000]])
+
+    Args:
+        x: points, metres.
+        octaves: number of frequencies, 2^k radians per metre.
+        open_bands: how many bands are open, 0 to `octaves`; see `open_hann_bands`.
+
+    Returns:
+        (w_0 sin x, w_0 cos x, ..., w_{L-1} sin 2^{L-1} x, w_{L-1} cos 2^{L-1} x), d columns each.
+    """
+    angles = x[:, None] * _frequencies(x, octaves, include_pi=False)
+    bands = torch.arange(octaves, dtype=x.dtype, device=x.device)
+    windows = (1 - torch.cos(math.pi * (open_bands - bands).clamp(0, 1))) / 2
+    return (torch.stack([angles.sin(), angles.cos()], 2) * windows[:, None, None]).flatten(1)
+
+
+def open_hann_bands(step: int, first_step: int, last_step: int, octaves: int) -> float:
+    """How many bands of `hann_encoding` are open at a training step: L max(step - first, 0) / (last - first).
+
+    >>> open_hann_bands(30_000, first_step=10_000, last_step=50_000, octaves=6)
+    3.0
+    """
+    return octaves * max(step - first_step, 0) / (last_step - first_step)

@@ -38,7 +38,8 @@ class NetworkConfig:
         activation: softplus(100 z) / 100 or ReLU.
         head: last step, tanh or nothing.
         weight_norm: each row of a matrix is a direction times a gain of its own.
-        start: "sphere" makes the first output begin near |x| - radius; "kaiming" is normal, by fan-out.
+        start: "sphere" makes the first output begin near |x| - radius; "kaiming" is normal, by fan-out; "torch" is
+            uniform up to 1 / sqrt(fan in), as torch.nn.Linear has it.
         radius: of that sphere, metres.
         hidden_dtype: type of the layers between the first and the last. With bfloat16 a signed distance is off by about
             a millimetre on average and a normal by some 1.5 degrees; "auto" takes it where the hardware is made for it.
@@ -55,7 +56,7 @@ class NetworkConfig:
     activation: Literal["softplus", "relu"] = "softplus"
     head: Literal["tanh", "linear"] = "linear"
     weight_norm: bool = True
-    start: Literal["sphere", "kaiming"] = "kaiming"
+    start: Literal["sphere", "kaiming", "torch"] = "kaiming"
     radius: float = 0.6
     hidden_dtype: Precision = "float32"
     native_softplus: bool = False
@@ -201,7 +202,8 @@ class Network(nn.Module):
     def __init__(self, config: NetworkConfig, generator: torch.Generator | None = None) -> None:
         super().__init__()
         self.config = config
-        starts = _sphere_start(config, generator) if config.start == "sphere" else _kaiming_start(config, generator)
+        start = {"sphere": _sphere_start, "kaiming": _kaiming_start, "torch": _torch_start}[config.start]
+        starts = start(config, generator)
         self.layers = nn.ModuleList([Layer(matrix, bias, config.weight_norm) for matrix, bias in starts])
 
     def forward(self, x: Float[Tensor, "S i"], constant: Float[Tensor, "c"] | None = None) -> Float[Tensor, "S o"]:
@@ -306,6 +308,15 @@ def _kaiming_start(config: NetworkConfig, generator: torch.Generator | None) -> 
     starts: list[tuple[Tensor, Tensor]] = []
     for columns, rows in config.layer_sizes():
         matrix = math.sqrt(2 / rows) * torch.randn(rows, columns, generator=generator)
+        bias = (2 * torch.rand(rows, generator=generator) - 1) / math.sqrt(columns)
+        starts.append((matrix, bias))
+    return starts
+
+
+def _torch_start(config: NetworkConfig, generator: torch.Generator | None) -> list[tuple[Tensor, Tensor]]:
+    starts: list[tuple[Tensor, Tensor]] = []
+    for columns, rows in config.layer_sizes():
+        matrix = (2 * torch.rand(rows, columns, generator=generator) - 1) / math.sqrt(columns)
         bias = (2 * torch.rand(rows, generator=generator) - 1) / math.sqrt(columns)
         starts.append((matrix, bias))
     return starts

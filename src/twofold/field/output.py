@@ -21,3 +21,16 @@ class FieldOutput:
     color: Float[Tensor, "S 3"]
     gradient: Float[Tensor, "S 3"] | None
     base: "FieldOutput | None" = None
+
+
+@dataclass(frozen=True)
+class RadianceOutput:
+    """Volume density and colour at points: what a field without a surface gives.
+
+    Attributes:
+        density: per metre, not negative.
+        color: 0..1.
+    """
+
+    density: Float[Tensor, "S"]
+    color: Float[Tensor, "S 3"]

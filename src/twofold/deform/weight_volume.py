@@ -1,0 +1,233 @@
+"""Skinning by a learned volume of canonical blend weights (HumanNeRF, MonoHuman).
+
+The volume lives in canonical space (T-pose). A point of observation space is moved by every bone to where it would be
+in canonical space, and each bone's weight is looked up at its own place (HumanNeRF Eqs. 3-5); a canonical point is
+moved forward with the weights at that one place (MonoHuman).
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.nn.utils import skip_init
+
+from twofold.body.skeleton import PARENTS
+from twofold.kernels.mlp import dense_layer, uniform, xavier_bound
+
+MARGIN = 0.3
+"""How far the canonical box reaches beyond the joints, metres."""
+ALONG, ACROSS = 0.12, 0.06
+"""Widths of a bone's Gaussian along and across it, metres (1 / the diagonal of S)."""
+TORSO, TORSO_FACTOR = (0, 3, 6, 9, 13, 14), 1.5
+"""Joints whose bones are wider across, and how much."""
+HEAD, HEAD_WIDTH, END_WIDTH = 15, 0.12, 0.04
+"""Joints without children have a ball: the head, and the hands and toes; metres."""
+MIN_SUM = 1e-3
+"""Smallest denominator when the prior is normalised."""
+MIN_WEIGHT = 1e-4
+"""Smallest sum of weights that the blended point is divided by."""
+LEAKY_SLOPE = 0.2
+LEAKY_GAIN = math.sqrt(2 / (1 + LEAKY_SLOPE**2))
+_CHANNELS = (1024, 512, 512, 256, 256, 25)
+
+
+@dataclass(frozen=True)
+class CanonicalBox:
+    """An axis-aligned box of canonical space, metres."""
+
+    low: Float[Tensor, "3"]
+    high: Float[Tensor, "3"]
+
+    def coordinates(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Points as `grid_sample` takes them: -1 to 1 from corner to corner, x first."""
+        return (points - self.low) * (2 / (self.high - self.low)) - 1
+
+    def lattice(self, size: int) -> Float[Tensor, "z y x 3"]:
+        """Positions of the grid's vertices, corners included, in the order of a volume's axes (z, y, x), metres."""
+        steps = torch.linspace(0, 1, size, dtype=self.low.dtype, device=self.low.device)
+        axes = [low + (high - low) * steps for low, high in zip(self.low, self.high, strict=True)]
+        return torch.stack(torch.meshgrid(*reversed(axes), indexing="ij")[::-1], -1)
+
+
+def canonical_box(joints: Float[Tensor, "24 3"], margin: float = MARGIN) -> CanonicalBox:
+    """The box of the T-pose joints, `margin` metres larger on every side.
+
+    >>> canonical_box(torch.zeros(24, 3))
+    CanonicalBox(low=tensor([-0.3000, -0.3000, -0.3000]), high=tensor([0.3000, 0.3000, 0.3000]))
+    """
+    return CanonicalBox(joints.amin(0) - margin, joints.amax(0) + margin)
+
+
+def bone_prior(joints: Float[Tensor, "24 3"], box: CanonicalBox, size: int = 32) -> Float[Tensor, "25 z y x"]:
+    """Where each bone is expected: Gaussians around the bones of a skeleton, background last; sums to one.
+
+    A joint's channel is the sum over its child bones of exp(-(a / 0.12)^2 - (c / 0.06)^2), with a and c the distances
+    from the bone's midpoint along and across the bone, metres (c is over 0.09 in the torso). This is the quadratic form
+    (p - m)^T R S^2 R^T (p - m) of HumanNeRF, which does not depend on how R turns about the bone. Joints without
+    children have a ball. The background is 1 - clip(sum, 0, 1); then all are divided by their sum.
+
+    Args:
+        joints: of the T-pose, metres.
+        box: that the volume fills.
+        size: vertices along each axis.
+    """
+    points = box.lattice(size)
+    channels = [_joint_prior(joint, joints, points) for joint in range(24)]
+    bones = torch.stack(channels)
+    prior = torch.cat([bones, 1 - bones.sum(0, keepdim=True).clamp(0, 1)])
+    return prior / prior.sum(0).clamp_min(MIN_SUM)
+
+
+def _joint_prior(joint: int, joints: Tensor, points: Tensor) -> Tensor:
+    children = [child for child, parent in enumerate(PARENTS) if parent == joint]
+    if not children:
+        width = HEAD_WIDTH if joint == HEAD else END_WIDTH
+        return torch.exp(-((points - joints[joint]) / width).square().sum(-1))
+    across = ACROSS * TORSO_FACTOR if joint in TORSO else ACROSS
+    total = torch.zeros_like(points[..., 0])
+    for child in children:
+        offset = points - (joints[joint] + joints[child]) / 2
+        along = offset @ F.normalize(joints[child] - joints[joint], dim=0)
+        squared_across = (offset.square().sum(-1) - along.square()).clamp_min(0)
+        total = total + torch.exp(-(along / ALONG).square() - squared_across / across**2)
+    return total
+
+
+class WeightVolume(nn.Module):
+    """The learned volume: softmax over 25 channels of (logits + log prior) (HumanNeRF Eq. 10).
+
+    A constant code of 256 numbers goes through a linear layer to 1024 channels and five transposed 3-D convolutions
+    (kernel 4, stride 2) to 25 channels of 32^3 logits; LeakyReLU(0.2) between. 63,589,145 parameters, and no input: its
+    result is the same for every pose, so one evaluation serves a whole training step, and rendering for ever.
+    """
+
+    log_prior: Tensor
+
+    def __init__(self, prior: Float[Tensor, "25 32 32 32"], generator: torch.Generator | None = None) -> None:
+        """The volume over `prior` (`bone_prior`)."""
+        super().__init__()
+        self.code = nn.Parameter(torch.randn(256, generator=generator))
+        bound = xavier_bound(256, _CHANNELS[0], LEAKY_GAIN)
+        self.first = dense_layer(256, _CHANNELS[0], bound, generator)
+        pairs = list(itertools.pairwise(_CHANNELS))
+        gains = [LEAKY_GAIN] * (len(pairs) - 1) + [1.0]
+        self.upsampling = nn.ModuleList(
+            [_upsampling(*pair, gain, generator) for pair, gain in zip(pairs, gains, strict=True)]
+        )
+        self.register_buffer("log_prior", prior.log())
+
+    def forward(self) -> Float[Tensor, "25 32 32 32"]:
+        """Blend weights of the 24 bones and the background; they sum to one everywhere."""
+        return (self.logits() + self.log_prior).softmax(0)
+
+    def logits(self) -> Float[Tensor, "25 32 32 32"]:
+        """What the network adds to the logarithm of the prior."""
+        h = F.leaky_relu(self.first(self.code), LEAKY_SLOPE)[None, :, None, None, None]
+        for index, layer in enumerate(self.upsampling):
+            h = layer(h)
+            if index < len(self.upsampling) - 1:
+                h = F.leaky_relu(h, LEAKY_SLOPE)
+        return h[0]
+
+
+def _upsampling(inputs: int, outputs: int, gain: float, generator: torch.Generator | None) -> nn.ConvTranspose3d:
+    """A transposed convolution that doubles each axis and starts with the same weights in all eight stride phases.
+
+    Each output sees (kernel / stride)^3 = 8 taps, so these count as the fan.
+    """
+    layer = cast(nn.ConvTranspose3d, skip_init(nn.ConvTranspose3d, inputs, outputs, 4, stride=2, padding=1))
+    bound = xavier_bound(8 * inputs, 8 * outputs, gain)
+    taps = uniform((inputs, outputs, 2, 2, 2), bound, generator)
+    with torch.no_grad():
+        for axis in (2, 3, 4):
+            taps = taps.repeat_interleave(2, axis)
+        layer.weight.copy_(taps)
+        layer.bias.zero_()
+    return layer
+
+
+@dataclass(frozen=True)
+class SkeletalPoints:
+    """Samples moved to canonical space by the skeleton.
+
+    Attributes:
+        index: which of the given points they are, ascending.
+        points: x_skel, canonical space, metres.
+        likelihood: f, the sum of the 24 bone weights: how likely a point belongs to the person; 0..1 and slightly more.
+    """
+
+    index: Int[Tensor, "n"]
+    points: Float[Tensor, "n 3"]
+    likelihood: Float[Tensor, "n"]
+
+
+def skeletal_backward(
+    weights: Float[Tensor, "C z y x"],
+    points: Float[Tensor, "S 3"],
+    to_canonical: Float[Tensor, "24 4 4"],
+    box: CanonicalBox,
+    min_likelihood: float | None = None,
+) -> SkeletalPoints:
+    """Points of observation space in canonical space: x_skel = sum_i w_i M_i x / max(sum_i w_i, 1e-4).
+
+    w_i = W_i(M_i x) is bone i's weight where that bone takes the point, zero outside the box; f = sum_i w_i
+    (HumanNeRF Eqs. 3-5). One batched lookup serves all bones, and the transforms are blended before they are applied:
+    sum_i w_i M_i x = (sum_i w_i M_i) x.
+
+    Args:
+        weights: blend weights, the 24 bones first (`WeightVolume`).
+        points: observation space, metres.
+        to_canonical: M_i, posed to T-pose: the inverse of `joint_transforms`.
+        box: that the volume fills.
+        min_likelihood: keep only the points with a larger f, found by a lookup without gradients; None keeps all. f
+            multiplies alpha, so 1e-3 changes no pixel by more than that fraction for each sample left out.
+    """
+    if min_likelihood is None:
+        index = torch.arange(len(points), device=points.device)
+    else:
+        with torch.no_grad():
+            index = (_bone_weights(weights, points, to_canonical, box).sum(-1) > min_likelihood).nonzero()[:, 0]
+        points = points[index]
+    bone_weights = _bone_weights(weights, points, to_canonical, box)
+    likelihood = bone_weights.sum(-1)
+    blended = bone_weights / likelihood.clamp_min(MIN_WEIGHT)[:, None]
+    return SkeletalPoints(index, _moved(blended, to_canonical, points), likelihood)
+
+
+def skeletal_forward(
+    weights: Float[Tensor, "C z y x"],
+    x_canonical: Float[Tensor, "S 3"],
+    from_canonical: Float[Tensor, "24 4 4"],
+    box: CanonicalBox,
+) -> Float[Tensor, "S 3"]:
+    """Canonical points in a pose: x = sum_i W_i(x_c) M_i^-1 x_c / max(sum_i W_i(x_c), 1e-4) (MonoHuman Eq. 5).
+
+    All weights are looked up at the point itself.
+
+    Args:
+        weights: blend weights, the 24 bones first.
+        x_canonical: metres.
+        from_canonical: M_i^-1, T-pose to posed: `joint_transforms`.
+        box: that the volume fills.
+    """
+    grid = box.coordinates(x_canonical)[None, None, None]
+    looked_up = F.grid_sample(weights[None, :24], grid, align_corners=True)[0, :, 0, 0].T
+    blended = looked_up / looked_up.sum(-1, keepdim=True).clamp_min(MIN_WEIGHT)
+    return _moved(blended, from_canonical, x_canonical)
+
+
+def _bone_weights(weights: Tensor, points: Tensor, to_canonical: Tensor, box: CanonicalBox) -> Float[Tensor, "S 24"]:
+    """W_i(M_i x) for every bone: the bones are the batch of one lookup in volumes of one channel."""
+    places = points @ to_canonical[:, :3, :3].transpose(1, 2) + to_canonical[:, None, :3, 3]
+    grid = box.coordinates(places)[:, None, None]
+    return F.grid_sample(weights[:24, None], grid, align_corners=True)[:, 0, 0, 0].T
+
+
+def _moved(blended: Tensor, transforms: Tensor, points: Tensor) -> Tensor:
+    rows = (blended @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4))
+    return (rows[..., :3] * points[:, None]).sum(-1) + rows[..., 3]
