@@ -147,7 +147,7 @@ def _upsampling(inputs: int, outputs: int, gain: float, generator: torch.Generat
         for axis in (2, 3, 4):
             taps = taps.repeat_interleave(2, axis)
         layer.weight.copy_(taps)
-        layer.bias.zero_()
+        cast(Tensor, layer.bias).zero_()
     return layer
 
 
