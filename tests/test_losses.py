@@ -153,3 +153,97 @@ def test_s3im_is_the_same_on_every_device(device, generator):
     color, truth = random(41, 3), random(41, 3, seed=1)
     found = losses.s3im(color.to(device), truth.to(device), generator)
     assert found.item() == pytest.approx(losses.s3im(color, truth, torch.Generator().manual_seed(0)).item())
+
+
+def test_squared_error_is_the_mean_over_rays_and_channels():
+    color, truth = random(7, 3), random(7, 3, seed=1)
+    exact = sum((a - b) ** 2 for a, b in zip(color.flatten().tolist(), truth.flatten().tolist(), strict=True)) / 21
+    assert losses.squared_error(color, truth).item() == pytest.approx(exact)
+
+
+def test_binarisation_is_twice_the_mean_entropy_and_finite_at_its_ends():
+    opacity = random(9)
+    exact = -2 / 9 * sum(a * math.log(a + 1e-6) + (1 - a) * math.log(1 - a + 1e-6) for a in opacity.tolist())
+    assert losses.binarisation(opacity).item() == pytest.approx(exact)
+    ends = torch.tensor([0.0, 1.0], requires_grad=True)
+    loss = losses.binarisation(ends)
+    loss.backward()
+    assert loss.item() == pytest.approx(0, abs=1e-5)
+    assert ends.grad.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("loss", "counts", "value"),
+    [
+        (losses.opacity_sparseness, lambda d: d > 0.05, lambda a: abs(a)),
+        (losses.in_shape, lambda d: d <= 0, lambda a: abs(1 - a)),
+    ],
+)
+def test_opacity_terms_are_means_over_the_rays_that_count(loss, counts, value):
+    opacity, clearance = random(40), 0.3 * (random(40, seed=1) - 0.5)
+    chosen = [value(a) for a, d in zip(opacity.tolist(), clearance.tolist(), strict=True) if counts(d)]
+    assert 0 < len(chosen) < 40
+    assert loss(opacity, clearance).item() == pytest.approx(sum(chosen) / len(chosen))
+    assert loss(opacity, torch.full((40,), 0.03, dtype=torch.float64)).item() == 0
+
+
+def test_sparseness_grows_while_in_shape_fades():
+    sparse, inside = zip(*(losses.sparseness_weights(e) for e in range(0, 301, 50)), strict=True)
+    assert list(sparse) == sorted(sparse)
+    assert list(inside) == sorted(inside, reverse=True)
+    assert losses.sparseness_weights(100) == pytest.approx((3e-3 * 251, 0.5e-2))
+
+
+def test_consistency_is_the_mean_over_likely_points_that_come_back_elsewhere():
+    x, shift, likelihood = random(50, 3), 0.1 * (random(50, 3, seed=1) - 0.5), random(50, seed=2)
+    chosen = [
+        math.dist(a, b)
+        for a, b, w in zip(x.tolist(), (x + shift).tolist(), likelihood.tolist(), strict=True)
+        if w > 0.3 and math.dist(a, b) > 0.05
+    ]
+    assert 0 < len(chosen) < 50
+    found = losses.deformation_consistency(x, x + shift, likelihood)
+    assert found.item() == pytest.approx(sum(chosen) / len(chosen))
+    same = x.clone().requires_grad_()
+    losses.deformation_consistency(x, same, likelihood).backward()
+    assert same.grad.isfinite().all()
+
+
+def test_box_terms_are_the_printed_sums():
+    sizes, p, hit = random(24, 3), random(6, 24), (random(6, seed=1) > 0.5).double()
+    assert losses.box_volumes(sizes).item() == pytest.approx(sum(a * b * c for a, b, c in sizes.tolist()))
+    exact = sum((h - sum(row)) ** 2 for h, row in zip(hit.tolist(), p.tolist(), strict=True)) / 6
+    assert losses.box_assignment(p, hit).item() == pytest.approx(exact)
+
+
+def test_only_long_offsets_cost_something():
+    offsets = 0.06 * (random(40, 3) - 0.5)
+    lengths = [math.hypot(*row) for row in offsets.tolist()]
+    assert 0 < sum(n > 0.04 for n in lengths) < 40
+    assert losses.point_offsets(offsets).item() == pytest.approx(sum(n * n for n in lengths if n > 0.04) / 40)
+
+
+def test_neighbours_keep_their_distances():
+    posed, rest = random(5, 3), random(5, 3, seed=1)
+    neighbours = torch.tensor([[1, 2], [0, 2], [3, 4], [4, 0], [0, 1]])
+    total = 0.0
+    for n, row in enumerate(neighbours.tolist()):
+        for k in row:
+            first = math.dist(posed[n].tolist(), posed[k].tolist())
+            total += (first - math.dist(rest[n].tolist(), rest[k].tolist())) ** 2
+    assert losses.neighbour_distances(posed, rest, neighbours).item() == pytest.approx(total / 10)
+
+
+def test_points_outside_the_surface_cost_their_distance():
+    assert losses.surface_points(torch.tensor([-1.0, 0.0, 0.3, 0.1])).item() == pytest.approx(0.1)
+
+
+def test_background_counts_where_nobody_stands_and_leaves_the_opacity_alone():
+    predicted, truth, opacity = random(6, 3), random(6, 3, seed=1), random(6, seed=2).requires_grad_()
+    exact = 0.0
+    for p, t, a in zip(predicted.tolist(), truth.tolist(), opacity.tolist(), strict=True):
+        exact += sum((1 - a) * (x - y) ** 2 for x, y in zip(p, t, strict=True)) / 18
+    loss = losses.background(predicted.requires_grad_(), truth, opacity)
+    loss.backward()
+    assert loss.item() == pytest.approx(exact)
+    assert opacity.grad is None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -18,6 +18,14 @@ S3IM_WINDOW = 4
 """Pixels across the window of `s3im`, and between two windows."""
 S3IM_SIGMA = 1.5
 """Standard deviation of that window, pixels."""
+ENTROPY_OFFSET = 1e-6
+"""Added inside the logarithms of `binarisation`."""
+SPARSE_CLEARANCE, SPARSE_EPOCHS = 0.05, 200
+"""How far a ray without opacity stays from the surface, metres; and the epoch from which its weight is constant."""
+CONSISTENT_LIKELIHOOD, CONSISTENT_DISTANCE = 0.3, 0.05
+"""Samples that `deformation_consistency` counts: sum of bone weights, and distance in metres."""
+MAX_POINT_OFFSET = 0.04
+"""Offsets up to this length cost nothing in `point_offsets`, metres."""
 MOST_STEPS = 10**12
 """No training takes so many; a step of it means never."""
 
@@ -159,6 +167,137 @@ def s3im(color: Float[Tensor, "R 3"], truth: Float[Tensor, "R 3"], generator: to
     order = order[: height * width]
     first, second = (c[order].T.reshape(3, 1, height, width) for c in (color, truth))
     return 1 - _windowed_ssim(first, second).mean()
+
+
+def squared_error(color: Float[Tensor, "*b"], truth: Float[Tensor, "*b"]) -> Float[Tensor, ""]:
+    """Mean squared difference of colours (HumanNeRF, MonoHuman)."""
+    return (color - truth).square().mean()
+
+
+def binarisation(opacity: Float[Tensor, "R"]) -> Float[Tensor, ""]:
+    """Twice the mean entropy of the opacity, -a ln(a + e) - (1 - a) ln(1 - a + e) with e = 1e-6 (Vid2Avatar).
+
+    It is zero where every pixel is either person or background.
+
+    >>> binarisation(torch.tensor([0.5, 1.0])).round(decimals=4)
+    tensor(0.6931)
+
+    Args:
+        opacity: rendered, 0..1.
+    """
+    rest = 1 - opacity
+    return -2 * (opacity * (opacity + ENTROPY_OFFSET).log() + rest * (rest + ENTROPY_OFFSET).log()).mean()
+
+
+def opacity_sparseness(opacity: Float[Tensor, "R"], clearance: Float[Tensor, "R"]) -> Float[Tensor, ""]:
+    """Mean opacity of rays that stay more than 5 cm away from the canonical surface; zero without any (Vid2Avatar).
+
+    >>> opacity_sparseness(torch.tensor([0.5, 1.0]), torch.tensor([0.1, 0.0]))
+    tensor(0.5000)
+
+    Args:
+        opacity: rendered, 0..1.
+        clearance: smallest signed distance of each ray's samples to the canonical mesh, metres.
+    """
+    return _mean_over(opacity.abs(), (clearance > SPARSE_CLEARANCE).to(opacity.dtype))
+
+
+def in_shape(opacity: Float[Tensor, "R"], clearance: Float[Tensor, "R"]) -> Float[Tensor, ""]:
+    """Mean of 1 - opacity of rays that enter the canonical surface; zero without any (Vid2Avatar).
+
+    Args:
+        opacity: rendered, 0..1.
+        clearance: smallest signed distance of each ray's samples to the canonical mesh, metres.
+    """
+    return _mean_over((1 - opacity).abs(), (clearance <= 0).to(opacity.dtype))
+
+
+def sparseness_weights(epoch: int) -> tuple[float, float]:
+    """Weights of `opacity_sparseness` and `in_shape` at an epoch: 3e-3 (1 + e^2 / 40) and 1e-2 (1 - e / 200), e <= 200.
+
+    >>> sparseness_weights(0), sparseness_weights(300)
+    ((0.003, 0.01), (3.003, 0.0))
+    """
+    e = min(epoch, SPARSE_EPOCHS)
+    return 3e-3 * (1 + e * e / 40), 1e-2 * (1 - e / SPARSE_EPOCHS)
+
+
+def deformation_consistency(
+    x_observed: Float[Tensor, "S 3"], x_returned: Float[Tensor, "S 3"], likelihood: Float[Tensor, "S"]
+) -> Float[Tensor, ""]:
+    """Mean distance between points and where they come back after both deformations (MonoHuman Eq. 7).
+
+    Only samples count whose bone weights sum to more than 0.3 and that come back more than 5 cm away; zero without any.
+
+    Args:
+        x_observed: points of observation space, metres.
+        x_returned: the same after the backward and the forward deformation, metres.
+        likelihood: sum of the bone weights.
+    """
+    distance = (x_observed - x_returned).norm(dim=-1)
+    counts = (likelihood > CONSISTENT_LIKELIHOOD) & (distance > CONSISTENT_DISTANCE)
+    return _mean_over(distance, counts.to(distance.dtype))
+
+
+def box_volumes(half_sizes: Float[Tensor, "J 3"]) -> Float[Tensor, ""]:
+    """Sum over boxes of the product of their half-sizes, cubic metres; keeps boxes tight (DANBO, PM-Avatar).
+
+    >>> box_volumes(torch.tensor([[1.0, 2.0, 3.0], [1.0, 1.0, 1.0]]))
+    tensor(7.)
+    """
+    return half_sizes.prod(-1).sum()
+
+
+def box_assignment(probability: Float[Tensor, "S J"], hit: Float[Tensor, "S"]) -> Float[Tensor, ""]:
+    """Mean of (hit - sum_j p_j)^2: a sample on the person belongs to one box, others to none (DANBO).
+
+    Args:
+        probability: of each box, zero for boxes that do not hold the sample (`field.local_volumes.LocalVolumes`).
+        hit: one for samples on the person, else zero.
+    """
+    return (hit - probability.sum(-1)).square().mean()
+
+
+def point_offsets(offsets: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+    """Mean over all points of |offset|^2 where it is longer than 4 cm, else zero (NPC).
+
+    Args:
+        offsets: from skinned to posed points, before long ones are left out, metres.
+    """
+    squared = offsets.square().sum(-1)
+    return torch.where(squared > MAX_POINT_OFFSET**2, squared, torch.zeros_like(squared)).mean()
+
+
+def neighbour_distances(
+    posed: Float[Tensor, "n 3"], rest: Float[Tensor, "n 3"], neighbours: Int[Tensor, "n k"]
+) -> Float[Tensor, ""]:
+    """Mean of (posed distance - rest distance)^2 between each point and its neighbours (NPC).
+
+    Args:
+        posed: points in a pose, metres.
+        rest: the same in the rest pose, metres.
+        neighbours: numbers of the neighbours of each point, the point itself not among them.
+    """
+    first, second = ((p[:, None] - p[neighbours]).norm(dim=-1) for p in (posed, rest))
+    return (first - second).square().mean()
+
+
+def surface_points(sdf: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Mean of max(s, 0) at the points: they shall not lie outside of the surface (NPC)."""
+    return sdf.relu().mean()
+
+
+def background(
+    predicted: Float[Tensor, "R 3"], truth: Float[Tensor, "R 3"], opacity: Float[Tensor, "R"]
+) -> Float[Tensor, ""]:
+    """Mean of (1 - opacity) (predicted - truth)^2 for a learned background; no gradient by the opacity (NPC).
+
+    Args:
+        predicted: the background's colour, 0..1.
+        truth: of the image, 0..1.
+        opacity: rendered, 0..1.
+    """
+    return ((1 - opacity.detach())[:, None] * (predicted - truth).square()).mean()
 
 
 def _mean_over(values: Tensor, shares: Tensor) -> Tensor:

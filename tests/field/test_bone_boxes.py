@@ -9,6 +9,7 @@ from twofold.field.bone_boxes import (
     RIGID_PARTS,
     TWO_HOPS,
     BoxSizes,
+    assign_to_boxes,
     bone_frames,
     box_coordinates,
     box_window,
@@ -117,3 +118,15 @@ def test_parts_are_nineteen_and_reach_only_each_other():
     assert len(RIGID_PARTS) == 19
     assert set(TWO_HOPS) == set(RIGID_PARTS)
     assert all(part in row and set(row) <= set(RIGID_PARTS) and len(row) >= 3 for part, row in TWO_HOPS.items())
+
+
+def test_points_belong_to_the_nearest_box_that_holds_them(generator):
+    coordinates = 1.5 * torch.randn(60, 7, 3, generator=generator)
+    half_sizes = 0.1 + torch.rand(7, 3, generator=generator)
+    found = assign_to_boxes(coordinates, half_sizes, tries=4).tolist()
+    for n, part in enumerate(found):
+        by_distance = sorted(range(7), key=lambda j: (coordinates[n, j] * half_sizes[j]).norm().item())
+        holding = [j for j in by_distance[:4] if coordinates[n, j].abs().max() <= 1]
+        assert part == (holding[0] if holding else -1)
+    assert -1 in found
+    assert len(set(found)) > 4

@@ -7,7 +7,7 @@ all three lie in -1..1. Joints follow SMPL's order.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -144,6 +144,26 @@ def box_window(coordinates: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
     """
     squared = coordinates.square()
     return torch.exp(-WINDOW_SHARPNESS * (squared * squared * squared).sum(-1))
+
+
+def assign_to_boxes(
+    coordinates: Float[Tensor, "S J 3"], half_sizes: Float[Tensor, "J 3"], tries: int = 5
+) -> Int[Tensor, "S"]:
+    """The box that each point belongs to: of the `tries` with the nearest centres, the nearest that holds it; else -1.
+
+    >>> assign_to_boxes(torch.tensor([[[2.0, 0.0, 0.0], [0.9, 0.0, 0.0]]]), torch.tensor([[0.1] * 3, [1.0] * 3]))
+    tensor([1])
+
+    Args:
+        coordinates: box coordinates of the points.
+        half_sizes: of the boxes, metres.
+        tries: how many boxes are looked at.
+    """
+    distances = (coordinates * half_sizes).norm(dim=-1)
+    order = distances.argsort(1)[:, :tries]
+    holds = inside_boxes(coordinates).gather(1, order)
+    first = holds.int().argmax(1, keepdim=True)
+    return torch.where(holds.any(1), order.gather(1, first)[:, 0], -1)
 
 
 def _children(joint: int) -> list[int]:

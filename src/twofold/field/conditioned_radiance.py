@@ -45,9 +45,9 @@ class ColorHead(nn.Module):
 
 
 class ConditionedRadiance(nn.Module):
-    """Density ReLU(MLP(x) + noise) and colour of a feature: eight hidden layers of 256, the input again before the sixth.
+    """Density ReLU(MLP(x) + noise) and colour of a feature.
 
-    With its colour head: 679,812 parameters for DANBO (195 inputs, view of 27), 971,780 for PM-Avatar (768, 16).
+    Eight hidden layers of 256, the input again before the sixth. With its colour head: 679,812 parameters for DANBO (195 inputs, view of 27), 971,780 for PM-Avatar (768, 16).
 
     Args:
         inputs: columns of the feature.

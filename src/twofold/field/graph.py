@@ -81,8 +81,8 @@ class NodeLinear(nn.Module):
 class GraphLinear(nn.Module):
     """A graph layer on the skeleton: y_i = sum_j (A o M)_ij W_j x_j + b, M the bones and the nodes themselves.
 
-    The adjacency A is learned; it starts at 1 on the diagonal and at N(0.05, 0.05^2), at least 0.01, elsewhere. The bias
-    is shared by all nodes and starts at zero.
+    The adjacency A is learned; it starts at 1 on the diagonal and at N(0.05, 0.05^2), at least 0.01, elsewhere. The
+    bias is shared by all nodes and starts at zero.
 
     Args:
         inputs: columns of each joint.

@@ -43,8 +43,8 @@ class LocalVolumes(nn.Module):
     """A feature of 15 numbers for each sample, blended over the boxes that hold it (DANBO Eqs. 3-7).
 
     h_j = [tables along each axis at x_j] exp(-2 sum x_j^6); p_j = inside_j (1.002 sigmoid(a_j) - 0.001) with a a graph
-    network of all h; the feature is the sum of p_j h_j over the rigid parts. The tables come from a graph network of the
-    pose: 5 features, 16 bins, 3 axes a joint. 1,736,704 parameters for the pose and 38,264 for the blending.
+    network of all h; the feature is the sum of p_j h_j over the rigid parts. The tables come from a graph network of
+    the pose: 5 features, 16 bins, 3 axes a joint. 1,736,704 parameters for the pose and 38,264 for the blending.
     """
 
     def __init__(self, generator: torch.Generator | None = None) -> None:

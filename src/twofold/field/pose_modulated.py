@@ -71,7 +71,7 @@ class PoseModulatedField(nn.Module):
         samples = len(coordinates)
         first_window = box_window(coordinates.detach())
         # By joint, then by sample: the pairs of one joint stand together.
-        joint, sample = (first_window.T > min_window).nonzero().unbind(-1)
+        joint, sample = (min_window < first_window.T).nonzero().unbind(-1)
         x, window = coordinates[sample, joint], first_window[sample, joint][:, None]
         weight = window * self._second_window(pose, x, window, joint, sample, samples)[sample, joint][:, None]
         pose_mix = torch.zeros_like(pose[:1].expand(samples, -1)).index_add(0, sample, weight * pose[joint])

@@ -8,7 +8,7 @@ from torch import Tensor
 def spherical_harmonics(directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 16"]:
     """The 16 real spherical harmonics of degrees 0 to 3 ("degree 4" as encodings count), by degree, then order -l..l.
 
-    Orthonormal on the unit sphere, with the sign (-1)^m of Condon and Shortley, as the encodings of instant NGP have it.
+    Orthonormal on the unit sphere, with the sign (-1)^m of Condon and Shortley, as instant NGP has it.
 
     >>> spherical_harmonics(torch.tensor([0.0, 0.0, 1.0]))[:4].round(decimals=4)
     tensor([ 0.2821, -0.0000,  0.4886, -0.0000])
