@@ -47,7 +47,8 @@ class ColorHead(nn.Module):
 class ConditionedRadiance(nn.Module):
     """Density ReLU(MLP(x) + noise) and colour of a feature.
 
-    Eight hidden layers of 256, the input again before the sixth. With its colour head: 679,812 parameters for DANBO (195 inputs, view of 27), 971,780 for PM-Avatar (768, 16).
+    Eight hidden layers of 256, the input again before the sixth. With the colour head there
+    are 679,812 parameters for DANBO (195 inputs, view of 27) and 971,780 for PM-Avatar (768, 16).
 
     Args:
         inputs: columns of the feature.
