@@ -8,10 +8,13 @@ from twofold.body.skeleton import PARENTS, joint_transforms
 from twofold.deform.weight_volume import (
     CanonicalBox,
     WeightVolume,
+    _bone_weights,
+    _looked_up,
     bone_prior,
     canonical_box,
     skeletal_backward,
     skeletal_forward,
+    upsample,
 )
 from twofold.geometry.rotations import rigid_inverse
 
@@ -156,6 +159,34 @@ def test_volume_lies_over_the_box_corner_to_corner():
     assert lattice[0, 0, 2].tolist() == [1, 0, 0]
     assert lattice[2, 1, 0].tolist() == [0, 1, 3]
     assert box.coordinates(lattice[2, 2, 2]).tolist() == [1, 1, 1]
+
+
+def test_compiled_lookup_is_that_of_torch_in_value_and_gradient(generator):
+    weights = torch.rand(25, 6, 5, 7, generator=generator)
+    box = canonical_box(JOINTS.float())
+    bones = rigid_inverse(transforms(generator)).float()
+    points = 0.8 * torch.randn(3000, 3, generator=generator)
+    mix = torch.randn(3000, 24, generator=generator)
+    found = []
+    for lookup, dtype in ((_bone_weights, torch.float32), (_looked_up, torch.float64)):
+        inputs = [t.to(dtype).requires_grad_() for t in (weights, points, bones)]
+        wide = CanonicalBox(box.low.to(dtype), box.high.to(dtype))
+        values = lookup(*inputs, wide)
+        found.append([values, *torch.autograd.grad((values * mix.to(dtype)).sum(), inputs)])
+    for compiled, twin in zip(*found, strict=True):
+        torch.testing.assert_close(compiled.double(), twin, atol=1e-4 * twin.abs().max().item(), rtol=1e-4)
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_upsampling_is_the_transposed_convolution(size, generator):
+    layer = torch.nn.ConvTranspose3d(5, 3, 4, stride=2, padding=1).double()
+    h = torch.randn(5, size, size, size, generator=generator, dtype=torch.float64, requires_grad=True)
+    found, expected = upsample(h.permute(1, 2, 3, 0), layer).permute(3, 0, 1, 2), layer(h[None])[0]
+    torch.testing.assert_close(found, expected)
+    mix = torch.randn(expected.shape, generator=generator, dtype=torch.float64)
+    inputs = [h, *layer.parameters()]
+    for a, b in zip(*(torch.autograd.grad((y * mix).sum(), inputs) for y in (found, expected)), strict=True):
+        torch.testing.assert_close(a, b)
 
 
 @pytest.fixture(scope="module")
