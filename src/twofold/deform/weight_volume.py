@@ -19,8 +19,8 @@ from torch.nn.utils import skip_init
 
 from twofold.body.skeleton import PARENTS
 from twofold.deform import weight_volume_kernels as kernels
-from twofold.geometry.threads import in_parts
 from twofold.kernels.mlp import dense_layer, uniform, xavier_bound
+from twofold.kernels.parallel import in_parts
 
 MARGIN = 0.3
 """How far the canonical box reaches beyond the joints, metres."""

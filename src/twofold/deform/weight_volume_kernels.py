@@ -9,7 +9,7 @@ bones, which own their channels) that a call handles. Vertices outside the volum
 
 import numpy as np
 
-from twofold.geometry.threads import compiled
+from twofold.kernels.parallel import compiled
 
 
 @compiled

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from twofold.volume.samplers import invert
+from twofold.sampling.error_bounded import invert
 
 WEIGHT_FLOOR = 0.01
 """Added to every weight, so that some depths go where nothing was found."""

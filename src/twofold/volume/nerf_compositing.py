@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from twofold.geometry.samples import Samples
+from twofold.volume.samples import Samples
 
 OPEN_INTERVAL = 1e10
 """Length of the last interval of a ray."""
