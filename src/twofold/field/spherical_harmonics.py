@@ -10,8 +10,8 @@ def spherical_harmonics(directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 
 
     Orthonormal on the unit sphere, with the sign (-1)^m of Condon and Shortley, as instant NGP has it.
 
-    >>> spherical_harmonics(torch.tensor([0.0, 0.0, 1.0]))[:4].round(decimals=4)
-    tensor([ 0.2821, -0.0000,  0.4886, -0.0000])
+    >>> spherical_harmonics(torch.tensor([0.0, 0.0, 1.0]))[[0, 2, 6]]
+    tensor([0.2821, 0.4886, 0.6308])
 
     Args:
         directions: unit length.
