@@ -14,18 +14,18 @@ from PIL import Image
 
 from twofold.errors import TwofoldError
 from twofold.report import (
+    CaptionedImage,
     Chart,
     Commands,
     Curve,
-    Figure,
+    KeyMetric,
     Row,
     Section,
     Table,
-    Verdict,
     Video,
+    key_metric,
     metrics_table,
     number,
-    verdict,
     write_report,
 )
 
@@ -93,8 +93,10 @@ def full_page(folder: Path) -> Page:
                 "Unseen views",
                 "First `code`.\n\nSecond, https://example.org/a.",
                 (
-                    Row((Figure(picture(), "truth"), Figure(folder / "kept.png", "avatar")), "Camera 2"),
-                    Row((Figure(torch.zeros(4, 4, 3)), Figure(torch.ones(4, 4)))),
+                    Row(
+                        (CaptionedImage(picture(), "truth"), CaptionedImage(folder / "kept.png", "avatar")), "Camera 2"
+                    ),
+                    Row((CaptionedImage(torch.zeros(4, 4, 3)), CaptionedImage(torch.ones(4, 4)))),
                 ),
             ),
             Section("Motion", "", (Video("films/a turn.mp4", "once around"),)),
@@ -105,8 +107,11 @@ def full_page(folder: Path) -> Page:
             Section("Go on", "", (Commands((("twofold render run --size <n>", "Larger."),)),)),
         ],
         subtitle="40 frames",
-        verdicts=[Verdict("Novel view", "27.3", "dB", "26 dB", True), Verdict("Pose", "20.1", "dB", "24 dB", False)],
-        lead=Figure(picture(2)),
+        key_metrics=[
+            KeyMetric("Novel view", "27.3", "dB", "26 dB", True),
+            KeyMetric("Pose", "20.1", "dB", "24 dB", False),
+        ],
+        lead=CaptionedImage(picture(2)),
         credit="By nobody.",
     )
     assert path == folder / "report.html"
@@ -146,20 +151,20 @@ def test_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
     style = "".join(page.texts)
     assert "url(" not in style
     assert "@import" not in style
-    assert "prefers-color-scheme:dark" in style
+    assert "prefers-color-scheme: dark" in style
 
 
 def test_no_text_can_break_the_page(tmp_path: Path) -> None:
     evil = "\"'><script>alert(1)</script>&amp;"
     chart = Chart(evil, (Curve(evil, [0, 1], [0.0, 1.0]), Curve("b", [0], [1.0])), x_label=evil)
     parts = (
-        Row((Figure(picture(), evil),), evil),
+        Row((CaptionedImage(picture(), evil),), evil),
         chart,
         Table((evil,), ((evil,), (evil, evil))),
         Commands(((evil, evil),)),
     )
     path = write_report(
-        tmp_path, evil, [Section(evil, evil, parts)], evil, [Verdict(evil, evil, evil, evil)], credit=evil
+        tmp_path, evil, [Section(evil, evil, parts)], evil, [KeyMetric(evil, evil, evil, evil)], credit=evil
     )
     page = Page(path.read_text(encoding="utf-8"))
     assert not page.all("script")
@@ -175,31 +180,33 @@ def test_missing_or_unknown_files_are_one_clear_sentence(tmp_path: Path) -> None
         written(Video("turn.mp4"))
     with pytest.raises(TwofoldError, match=r"video .*lead\.mp4 is missing"):
         write_report(tmp_path, "x", [], lead=Video("lead.mp4"))
-    with pytest.raises(TwofoldError, match=r"picture .*a\.png is missing"):
-        written(Row((Figure(tmp_path / "a.png"),)))
+    with pytest.raises(TwofoldError, match=r"image .*a\.png is missing"):
+        written(Row((CaptionedImage(tmp_path / "a.png"),)))
     (tmp_path / "a.exr").write_bytes(b"x")
-    with pytest.raises(TwofoldError, match=r"a\.exr is no \.png, \.jpg"):
-        written(Row((Figure(tmp_path / "a.exr"),)))
+    with pytest.raises(TwofoldError, match=r"a\.exr is not one of \.png, \.jpg"):
+        written(Row((CaptionedImage(tmp_path / "a.exr"),)))
     with pytest.raises(TwofoldError, match="Cannot write"):
         write_report(tmp_path / "none", "x", [])
     assert not list(tmp_path.glob("*.html"))
 
 
 def test_verdicts_compare_with_their_goal() -> None:
-    view = verdict(METRICS, "novel_view.psnr_box", "Novel view", "dB", at_least=26.0)
-    assert view == Verdict("Novel view", "27.30", "dB", "goal ≥ 26 dB", True)
-    assert verdict(METRICS, "novel_view.psnr_box", "x", at_least=28).met is False
-    assert verdict(METRICS, "seconds.total", "x", "s", at_most=180.0) == Verdict("x", "151", "s", "goal ≤ 180 s", True)
-    assert verdict(METRICS, "seconds.total", "x", "s", at_most=150.0).met is False
-    assert verdict(METRICS, "novel_view.pictures", "x") == Verdict("x", "6.00", "", "", None)
+    view = key_metric(METRICS, "novel_view.psnr_box", "Novel view", "dB", at_least=26.0)
+    assert view == KeyMetric("Novel view", "27.30", "dB", "goal ≥ 26 dB", True)
+    assert key_metric(METRICS, "novel_view.psnr_box", "x", at_least=28).met is False
+    assert key_metric(METRICS, "seconds.total", "x", "s", at_most=180.0) == KeyMetric(
+        "x", "151", "s", "goal ≤ 180 s", True
+    )
+    assert key_metric(METRICS, "seconds.total", "x", "s", at_most=150.0).met is False
+    assert key_metric(METRICS, "novel_view.pictures", "x") == KeyMetric("x", "6.00", "", "", None)
 
 
 @pytest.mark.parametrize("key", ["geometry.chamfer_cm", "geometry.nothing", "nothing.at.all", "novel_view", "recipe"])
 def test_what_was_not_measured_is_a_dash_and_meets_no_goal(key: str) -> None:
-    missing = verdict(METRICS, key, "x", "cm", at_most=1.0)
-    assert missing == Verdict("x", "\N{EN DASH}", "", "goal ≤ 1 cm", False)
-    assert verdict(METRICS, key, "x").met is None
-    assert verdict({"a": math.nan}, "a", "x", "cm", at_most=1.0) == missing
+    missing = key_metric(METRICS, key, "x", "cm", at_most=1.0)
+    assert missing == KeyMetric("x", "\N{EN DASH}", "", "goal ≤ 1 cm", False)
+    assert key_metric(METRICS, key, "x").met is None
+    assert key_metric({"a": math.nan}, "a", "x", "cm", at_most=1.0) == missing
 
 
 def test_every_number_stands_beside_its_protocol() -> None:

@@ -1,27 +1,25 @@
-"""One HTML page that shows a run: figures, pictures, curves, tables, videos, and how to go on.
+"""One HTML page that shows a run: metrics, images, curves, tables, videos, and how to go on.
 
-The page needs nothing else but its videos, which lie beside it: style and pictures are inside, there is no script, and
+The page needs nothing else but its videos, which lie beside it: style and images are inside, there is no script, and
 it follows the reader's choice of light or dark.
 """
 
-import html
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
-from urllib.parse import quote
+from typing import Any, TypeAlias
 
 from twofold.errors import TwofoldError
 from twofold.files import write_bytes
-from twofold.html.charts import Chart, Curve, chart_svg
-from twofold.html.page import Table, Verdict, document, embedded, header, inline, paragraphs, table_html, tiles
+from twofold.html.charts import Chart, Curve, curves_svg
+from twofold.html.page import EmbeddedImage, KeyMetric, Table, embedded_image, render
 from twofold.outputs.sheets import Picture, as_bytes
 
 __all__ = [
-    "Chart", "Commands", "Curve", "Figure", "Row", "Section", "Table", "Verdict", "Video",
-    "metrics_table", "number", "verdict", "write_report",
+    "CaptionedImage", "Chart", "Commands", "Curve", "KeyMetric", "Row", "Section", "Table", "Video",
+    "key_metric", "metrics_table", "number", "write_report",
 ]  # fmt: skip
 
 FILE_NAME = "report.html"
@@ -30,24 +28,24 @@ MISSING = "\N{EN DASH}"
 
 
 @dataclass(frozen=True)
-class Figure:
-    """A picture, put into the page, with a caption: a file (PNG, JPEG, WebP) or colours."""
+class CaptionedImage:
+    """An image, put into the page, with a caption: a file (PNG, JPEG, WebP) or colours."""
 
-    picture: Path | Picture
+    image: Path | Picture
     caption: str = ""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Pictures to be compared side by side; on a phone they scroll sideways together."""
+    """Images to be compared side by side; on a phone they scroll sideways together."""
 
-    figures: tuple[Figure, ...]
+    images: tuple[CaptionedImage, ...]
     label: str = ""
 
 
 @dataclass(frozen=True)
 class Video:
-    """A film in the page's folder or below, named by its path from there."""
+    """A video in the page's folder or below, named by its path from there."""
 
     file: str
     caption: str = ""
@@ -61,6 +59,8 @@ class Commands:
 
 
 Part: TypeAlias = Row | Video | Chart | Table | Commands
+BOXES: dict[type, str] = {Row: "rows", Video: "videos", Chart: "charts", Table: "tables", Commands: "commands"}
+"""What a template calls a group of parts of one kind."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ def write_report(
     title: str,
     sections: Sequence[Section],
     subtitle: str = "",
-    verdicts: Sequence[Verdict] = (),
-    lead: Figure | Video | None = None,
+    key_metrics: Sequence[KeyMetric] = (),
+    lead: CaptionedImage | Video | None = None,
     credit: str = "",
 ) -> Path:
     """Writes `report.html` into a folder and returns its path.
@@ -88,52 +88,58 @@ def write_report(
         title: of the page.
         sections: in order.
         subtitle: one line under the title: capture, recipe, time.
-        verdicts: the numbers to see first.
-        lead: a picture or film beside the title.
+        key_metrics: the numbers to see first.
+        lead: an image or video beside the title.
         credit: whom to name; at the foot.
 
     Raises:
-        TwofoldError: a video or picture is missing, or the page cannot be written.
+        TwofoldError: a video or image is missing, or the page cannot be written.
     """
-    films = [p for s in sections for p in s.parts if isinstance(p, Video)]
-    for film in [*films, *([lead] if isinstance(lead, Video) else [])]:
-        if not (folder / film.file).is_file():
-            raise TwofoldError(f"The report's video {folder / film.file} is missing; render it first.")
-    shown = (_film(lead) if isinstance(lead, Video) else _figure(lead)) if lead else ""
-    body = (
-        f"{header(title, paragraphs(subtitle) + tiles(verdicts), shown)}"
-        f"<main>{''.join(map(_section, sections))}</main><footer>{paragraphs(credit)}</footer>"
+    videos = [p for s in sections for p in s.parts if isinstance(p, Video)]
+    for video in [*videos, *([lead] if isinstance(lead, Video) else [])]:
+        if not (folder / video.file).is_file():
+            raise TwofoldError(f"The report's video {folder / video.file} is missing; render it first.")
+    content = render(
+        "report.html",
+        title=title,
+        subtitle=subtitle,
+        key_metrics=key_metrics,
+        lead=_embedded(lead) if isinstance(lead, CaptionedImage) else lead,
+        sections=[
+            {"heading": section.heading, "text": section.text, "boxes": _boxes(section.parts)} for section in sections
+        ],
+        credit=credit,
     )
     path = folder / FILE_NAME
-    write_bytes(path, document(title, body))
+    write_bytes(path, content)
     return path
 
 
-def verdict(
+def key_metric(
     metrics: Mapping[str, object],
     key: str,
     label: str,
     unit: str = "",
     at_least: float | int | None = None,
     at_most: float | int | None = None,
-) -> Verdict:
-    """The verdict on one number of a metrics file, named by its dotted key; a dash where it was not measured."""
+) -> KeyMetric:
+    """One number of a metrics file beside its goal, named by its dotted key; a dash where it was not measured."""
     value = _found(metrics, key)
     sign, goal = ("≥", at_least) if at_least is not None else ("≤", at_most)
     wanted = "" if goal is None else f"goal {sign} {goal:g} {unit}".strip()
     if not isinstance(value, int | float) or not math.isfinite(value):
-        return Verdict(label, MISSING, "", wanted, None if goal is None else False)
+        return KeyMetric(label, MISSING, "", wanted, None if goal is None else False)
     met = None if goal is None else (value >= goal if at_least is not None else value <= goal)
-    return Verdict(label, f"{value:.{0 if abs(value) >= 100 else 2}f}", unit, wanted, met)
+    return KeyMetric(label, f"{value:.{0 if abs(value) >= 100 else 2}f}", unit, wanted, met)
 
 
 def metrics_table(metrics: Mapping[str, object]) -> Table:
-    """Every number of a metrics file with its protocol, section by section; lists (of single pictures) are left out.
+    """Every number of a metrics file with its protocol, section by section; lists (of single images) are left out.
 
-    >>> metrics_table({"novel_view": {"psnr": {"value": 30.0, "protocol": "whole picture"}, "pictures": 6}}).rows
-    (('Novel view',), ('psnr', '30.00', 'whole picture'), ('pictures', '6', ''))
+    >>> metrics_table({"novel_view": {"psnr": {"value": 30.0, "protocol": "whole image"}, "images": 6}}).rows
+    (('Novel view',), ('psnr', '30.00', 'whole image'), ('images', '6', ''))
     """
-    return Table(("number", "value", "how it was measured"), tuple(_metric_rows(metrics, "")))
+    return Table(("metric", "value", "how it was measured"), tuple(_metric_rows(metrics, "")))
 
 
 def number(value: float | int) -> str:
@@ -174,45 +180,24 @@ def _metric_rows(metrics: Mapping[str, object], heading: str) -> Iterator[tuple[
         yield from _metric_rows(entry, f"{heading}, {name.lower()}" if heading else name)
 
 
-def _section(section: Section) -> str:
+def _boxes(parts: Sequence[Part]) -> list[dict[str, Any]]:
     """Parts of one kind that follow each other share a box, so that charts stand side by side."""
-    boxes = [
-        f"<div class={kind.__name__.lower()}s>{''.join(map(_part, parts))}</div>"
-        for kind, parts in itertools.groupby(section.parts, type)
+    return [
+        {"kind": BOXES[kind], "parts": [_shown(part) for part in group]}
+        for kind, group in itertools.groupby(parts, type)
     ]
-    return f"<section><h2>{inline(section.heading)}</h2>{paragraphs(section.text)}{''.join(boxes)}</section>"
 
 
-def _part(part: Part) -> str:
+def _shown(part: Part) -> object:
+    """What the template shows of a part: its images embedded, its curves drawn."""
     if isinstance(part, Row):
-        label = f"<h3>{inline(part.label)}</h3>" if part.label else ""
-        return f"{label}<div class=strip tabindex=0>{''.join(map(_figure, part.figures))}</div>"
-    if isinstance(part, Video):
-        return _film(part)
+        return {"label": part.label, "images": [_embedded(image) for image in part.images]}
     if isinstance(part, Chart):
-        return f"<figure>{_legend(part)}{chart_svg(part)}</figure>"
-    if isinstance(part, Table):
-        return table_html(part)
-    lines = [f"<div><p>{inline(what)}</p><pre>{html.escape(line)}</pre></div>" for line, what in part.lines]
-    return "".join(lines)
+        legend = [curve.name for curve in part.curves] if len(part.curves) > 1 else []
+        return {"title": part.title, "svg": curves_svg(part), "legend": legend}
+    return part
 
 
-def _figure(figure: Figure) -> str:
-    caption = f"<figcaption>{inline(figure.caption)}</figcaption>" if figure.caption else ""
-    picture = figure.picture if isinstance(figure.picture, Path) else as_bytes(figure.picture)
-    source, (width, height) = embedded(picture)
-    wide = " class=wide" if width > 1.2 * height else ""
-    size = f"width={width} height={height}"
-    return f'<figure{wide}><img src="{source}" {size} alt="{html.escape(figure.caption)}">{caption}</figure>'
-
-
-def _film(video: Video) -> str:
-    caption = f"<figcaption>{inline(video.caption)}</figcaption>" if video.caption else ""
-    attributes = "controls autoplay loop muted playsinline"
-    return f'<figure><video src="{quote(video.file)}" {attributes}></video>{caption}</figure>'
-
-
-def _legend(chart: Chart) -> str:
-    names = [curve.name for curve in chart.curves] if len(chart.curves) > 1 else []
-    spans = "".join(f"<span class=c{i % 5}>{inline(name)}</span>" for i, name in enumerate(names))
-    return f"<figcaption><b>{inline(chart.title)}</b>{spans}</figcaption>"
+def _embedded(image: CaptionedImage) -> EmbeddedImage:
+    content = image.image if isinstance(image.image, Path) else as_bytes(image.image)
+    return embedded_image(content, image.caption)

@@ -123,7 +123,7 @@ def check(
 
     Args:
         capture: Capture folder.
-        out: Folder for the page and its numbers; by default CAPTURE/check.
+        out: Folder for the report and its numbers; by default CAPTURE/check.
         most: At most so many pictures are looked at, spread evenly.
     """
     from twofold.check.check_report import require_no_file, write_check
@@ -141,6 +141,6 @@ def check(
         console().print(f"{finding.level}: {finding}", soft_wrap=True)
     console().print(judgement.words, soft_wrap=True)
     wasted = judgement.level == "waste"
-    say(f"The page is {page}.", "mend what it names and check again" if wasted else f"twofold train {capture}")
+    say(f"The report is {page}.", "mend what it names and check again" if wasted else f"twofold train {capture}")
     if wasted:
         sys.exit(1)

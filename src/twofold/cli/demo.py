@@ -13,7 +13,6 @@ from twofold.capture.types import Capture, Frame, spread
 from twofold.errors import TwofoldError
 from twofold.evaluation import evaluate, with_protocols
 from twofold.files import plain_errors, write_json
-from twofold.html.charts import Chart, Curve
 from twofold.methods.base import Avatar
 from twofold.methods.factorized_recipes import quick
 from twofold.metrics.image import to_8bit
@@ -22,7 +21,18 @@ from twofold.outputs.sheets import sheet
 from twofold.outputs.video import write_video
 from twofold.outputs.views import draw, orbit, pose_canonically
 from twofold.recipe import Recipe
-from twofold.report import Commands, Figure, Row, Section, Video, metrics_table, verdict, write_report
+from twofold.report import (
+    CaptionedImage,
+    Chart,
+    Commands,
+    Curve,
+    Row,
+    Section,
+    Video,
+    key_metric,
+    metrics_table,
+    write_report,
+)
 from twofold.studio.generate import StudioConfig, make_studio
 from twofold.training.loop import Progress, train
 
@@ -137,18 +147,21 @@ def _page(
         Section(
             "Seen from where no camera stood",
             f"One camera trained the avatar. These are moments of its motion, seen by the other three. {shown}",
-            (Row((Figure(by_name["novel_view"]),)),),
+            (Row((CaptionedImage(by_name["novel_view"]),)),),
         ),
         Section(
             "In poses it never saw",
             f"Another motion of the same person, from the same unseen cameras. {shown}",
-            (Row((Figure(by_name["novel_pose"]),)), Video("pictures/novel_pose.mp4", "Full avatar and its base.")),
+            (
+                Row((CaptionedImage(by_name["novel_pose"]),)),
+                Video("pictures/novel_pose.mp4", "Full avatar and its base."),
+            ),
         ),
         Section(
             "The canonical avatar",
             "All frames are explained by one person in one pose; the low-frequency branch holds what is the same in "
             "all of them, the high-frequency branch what comes and goes with the pose.",
-            (Row((Figure(by_name["canonical"]),)), Video("pictures/orbit.mp4", "All around.")),
+            (Row((CaptionedImage(by_name["canonical"]),)), Video("pictures/orbit.mp4", "All around.")),
         ),
         Section("Training", "", (Chart("PSNR over each step's rays, dB", (Curve("PSNR", steps, values),)),)),
         Section("Every figure, and how it was measured", "", (metrics_table(with_protocols(metrics)),)),
@@ -166,17 +179,17 @@ def _page(
             ),
         ),
     ]
-    verdicts = [
-        verdict(metrics, "novel_view.psnr_box", "novel view", "dB", at_least=26),
-        verdict(metrics, "novel_pose.psnr_box", "novel pose", "dB", at_least=24),
-        verdict(metrics, "geometry.chamfer_cm", "surface error", "cm", at_most=1.0),
-        verdict(metrics, "seconds.total", "time", "s", at_most=180),
+    key_metrics = [
+        key_metric(metrics, "novel_view.psnr_box", "novel view", "dB", at_least=26),
+        key_metric(metrics, "novel_pose.psnr_box", "novel pose", "dB", at_least=24),
+        key_metric(metrics, "geometry.chamfer_cm", "surface error", "cm", at_most=1.0),
+        key_metric(metrics, "seconds.total", "time", "s", at_most=180),
     ]
     return write_report(
         out,
         "An animatable avatar from one camera",
         sections,
         f"Studio person {seed}: {FRAMES * 4 // 5} training pictures of {SIZE} x {SIZE}, recipe quick.",
-        verdicts,
+        key_metrics,
         Video("pictures/orbit.mp4"),
     )

@@ -1,16 +1,47 @@
-"""Curves over training as SVG; colours and fonts come from the page that they are put into."""
+"""Charts as SVG, drawn with matplotlib; colours and fonts come from the page that they are put into.
 
-import html
+The same data gives the same bytes: the salt of the ids is fixed, no date is stored, and the settings of the user's
+matplotlib are not read.
+"""
+
+import io
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any, Literal
+from xml.etree import ElementTree
 
+import matplotlib.style
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Ellipse, Patch, Polygon, Wedge
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 480, 260, 54, 26, 10, 40
-"""Size of a drawing and its margins, in its own units."""
 BINS = 160
 """Curves with more points are drawn as the means of bins, over the range that each bin spans."""
+SERIES = 5
+"""Colours for curves; a sixth curve has the first one's again."""
+NAMES = ("c0", "c1", "c2", "c3", "c4", "ink", "faint", "line", "accent", "bad", "left", "right", "trunk")
+"""Colours of the page, custom properties of its style sheet."""
+COLORS = {name: f"#0000{i + 1:02x}" for i, name in enumerate(NAMES)}
+"""What stands for them while matplotlib draws; `_svg` puts `var(--c0)` and so on in their place."""
+SETTINGS = {
+    "svg.fonttype": "none",  # Text stays text: it is searched, read aloud, and takes the page's font.
+    "svg.hashsalt": "twofold",
+    "text.parse_math": False,  # A dollar sign in a name is a dollar sign.
+    "font.family": "DejaVu Sans",  # Comes with matplotlib, so text is measured alike everywhere.
+    "font.size": 13,
+    "text.color": COLORS["faint"],
+    "xtick.labelcolor": COLORS["faint"],
+    "ytick.labelcolor": COLORS["faint"],
+    "axes.labelcolor": COLORS["faint"],
+    "grid.color": COLORS["line"],
+    "lines.solid_capstyle": "round",
+    "lines.solid_joinstyle": "round",
+}
 
 
 @dataclass(frozen=True)
@@ -32,80 +63,222 @@ class Chart:
     logarithmic: bool = False
 
 
-def chart_svg(chart: Chart) -> str:
-    """The drawing: lines of the classes c0..c4 in turn, ranges of the class `range`, lines of the grid `grid`."""
-    curves = [_points(curve, chart.logarithmic) for curve in chart.curves]
-    everything = np.concatenate([np.empty((0, 2)), *curves])
-    if not len(everything):
+@dataclass(frozen=True)
+class Bar:
+    """One bar: its name, its length, the page's colour it has, and whether it is drawn pale."""
+
+    name: str
+    value: float
+    color: Literal["left", "right", "trunk"]
+    pale: bool = False
+
+
+def curves_svg(chart: Chart) -> str:
+    """Lines, 480 x 260 units; long ones as the means of bins over the band between their least and largest values.
+
+    Each line is a group of class `curve`, each band one of class `band`.
+    """
+    curves = [_finite(curve, chart.logarithmic) for curve in chart.curves]
+    if not any(len(points) for points in curves):
         return "<p>Nothing was recorded.</p>"
-    (x_low, y_low), (x_high, y_high) = everything.min(0), everything.max(0)
-    spare = 0.04 * (y_high - y_low) or 0.5
-    low, high = np.array([x_low, y_low - spare]), np.array([max(x_high, x_low + 1), y_high + spare])
-
-    def place(points: np.ndarray) -> np.ndarray:
-        x, y = ((points - low) / (high - low)).T
-        return np.stack([LEFT + x * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - y * (HEIGHT - TOP - BOTTOM)], -1)
-
-    drawn: list[str] = []
-    for value, label in axis_ticks(low[1], high[1], chart.logarithmic):
-        y = place(np.array([[low[0], value]]))[0, 1]
-        drawn.append(f'<path class="grid" d="M{LEFT},{y:.1f}H{WIDTH - RIGHT}"/>')
-        drawn.append(f'<text x="{LEFT - 8}" y="{y:.1f}" dy=".35em" text-anchor="end">{label}</text>')
-    for value, label in axis_ticks(low[0], high[0]):
-        x = place(np.array([[value, low[1]]]))[0, 0]
-        drawn.append(f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 18}" text-anchor="middle">{label}</text>')
-    for i, points in enumerate(curves):
-        bins = np.array_split(points, min(len(points), BINS)) if len(points) else []
-        means = np.array([b.mean(0) for b in bins]).reshape(-1, 2)
-        if len(points) > BINS:
-            upper, lower = (np.array([f(b[:, 1]) for b in bins]) for f in (np.max, np.min))
-            outline = np.concatenate([np.stack([means[:, 0], upper], -1), np.stack([means[:, 0], lower], -1)[::-1]])
-            drawn.append(f'<polygon class="c{i % 5} range" points="{_listed(place(outline))}"/>')
-        drawn.append(f'<polyline class="c{i % 5}" points="{_listed(place(means))}"/>')
-    drawn.append(f'<text x="{WIDTH - RIGHT}" y="{HEIGHT - 4}" text-anchor="end">{html.escape(chart.x_label)}</text>')
-    opening = f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(chart.title)}">'
-    return f"{opening}{''.join(drawn)}</svg>"
+    with _axes(480, 260, (54, 26, 10, 40)) as (figure, axes):
+        if chart.logarithmic:
+            axes.set_yscale("log")
+        for i, points in enumerate(curves):
+            _curve(axes, points, COLORS[f"c{i % SERIES}"], chart.logarithmic)
+        _ticks(axes, chart.logarithmic)
+        axes.set_xlabel(chart.x_label, loc="right")
+        return _svg(figure, chart.title, "curves")
 
 
-def axis_ticks(low: float, high: float, logarithmic: bool = False) -> list[tuple[float, str]]:
-    """Round positions between two ends of an axis, and what to write there.
+def dots_svg(title: str, series: Sequence[Curve], bad_below: float, x_label: str = "frame") -> str:
+    """Values up to 1 over frames, 1020 x 264 units: a dot for each with its numbers as a tooltip, a band for bad ones.
 
-    >>> axis_ticks(0.0, 3000.0)[:3]
-    [(0.0, '0'), (500.0, '500'), (1000.0, '1,000')]
+    The first four series have colours of their own, all others share the fifth.
+    """
+    values = [value for one in series for value in one.values]
+    low = min(0.5, 0.1 * math.floor(10 * min(values)))
+    with _axes(1020, 264, (40, 14, 12, 46)) as (figure, axes):
+        axes.axhspan(low, bad_below, color=COLORS["bad"], alpha=0.09, linewidth=0, gid="class:bad")
+        for i, one in enumerate(series):
+            color = COLORS[f"c{min(i, SERIES - 1)}"]
+            axes.plot(one.steps, one.values, color=color, linewidth=1, alpha=0.45, clip_on=False)
+            axes.scatter(one.steps, one.values, s=18, color=color, linewidth=0, clip_on=False, gid=f"class:dots s{i}")
+        axes.set_ylim(low, 1)
+        first, last = axes.get_xlim()
+        axes.set_xlim(first, max(last, first + 1))
+        _ticks(axes, logarithmic=False, whole=True)
+        axes.set_xlabel(x_label, loc="right")
+        tooltips = [
+            [f"{one.name} at {x:g}: {y:.2f}" for x, y in zip(one.steps, one.values, strict=True)] for one in series
+        ]
+        return _svg(figure, title, "dots-over-frames", tooltips)
+
+
+def bars_svg(title: str, bars: Sequence[Bar], end: int, every: int, unit: str) -> str:
+    """Horizontal bars with their names and values, 440 units wide, over an axis from 0 to `end` with ticks."""
+    height = 25 * len(bars) + 30
+    with _axes(440, height, (130, 44, 4, 26)) as (figure, axes):
+        for i, bar in enumerate(bars):
+            long, alpha = max(min(bar.value, end), end / 200), 0.45 if bar.pale else 1
+            axes.barh(
+                i,
+                long,
+                0.64,
+                color=COLORS[bar.color],
+                alpha=alpha,
+                linewidth=0,
+                clip_on=False,
+                zorder=2,
+                gid="class:bar",
+            )
+            axes.annotate(f"{bar.value:.0f}{unit}", (long, i), (6, 0), textcoords="offset points", va="center")
+        axes.set_ylim(len(bars) - 0.4, -0.6)
+        axes.set_xlim(0, end)
+        axes.set_yticks(range(len(bars)), [bar.name for bar in bars])
+        marks = np.arange(0, end + every / 2, every).tolist()
+        axes.set_xticks(marks, [f"{mark:g}{unit}" for mark in marks])
+        axes.grid(axis="x")
+        return _svg(figure, title, "bars")
+
+
+def directions_svg(title: str, covered: Sequence[tuple[float, float]], marks: Sequence[float]) -> str:
+    """A circle around a person seen from above, 300 x 256 units, with sectors covered and directions marked.
 
     Args:
-        low: lower end, its decimal logarithm where the axis is logarithmic.
-        high: upper end, likewise.
-        logarithmic: labels are powers of ten of the positions.
+        title: what the drawing shows.
+        covered: where each covered sector begins and how wide it is, degrees; 0 is in front, 90 at the person's left.
+        marks: directions, degrees.
     """
-    if logarithmic and high - low > 0.7:
-        steps = (1,) if high - low > 2.5 else (1, 2, 5)
-        marks = [s * 10.0**e for e in range(math.floor(low), math.ceil(high) + 1) for s in steps]
-        return [(math.log10(m), f"{m:g}") for m in marks if low <= math.log10(m) <= high]
-    rough = (high - low) / 6
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(s * power for s in (1, 2, 2.5, 5, 10) if s * power >= 0.999 * rough)
-    values = [i * step for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
-    return [(v, _label(10**v, 4) if logarithmic else _label(v, 10)) for v in values]
+    with _axes(300, 256, (0, 0, 0, 0)) as (figure, axes):
+        axes.set(xlim=(-150, 150), ylim=(-128, 128), xticks=[], yticks=[])
+        axes.add_patch(Circle((0, 0), 96, fill=False, edgecolor=COLORS["line"], linewidth=2))
+        for start, width in covered:
+            # matplotlib counts counter-clockwise from the right; here front is below, the left at the right.
+            sector = Wedge((0, 0), 96, start - 90, start - 90 + min(width, 359.999), gid="class:covered")
+            axes.add_patch(_filled(sector, "accent", 0.2))
+        axes.add_patch(_filled(Ellipse((0, 0), 60, 26), "faint"))
+        axes.add_patch(_filled(Circle((0, -2), 11), "ink"))
+        axes.add_patch(_filled(Polygon([(-4, -12), (0, -19), (4, -12)]), "ink"))
+        for degrees in marks:
+            axes.add_patch(_filled(Circle(_around(degrees, 96), 3, gid="class:mark"), "accent"))
+        for degrees, word, across, upright in (
+            (0, "front", "center", "top"), (90, "left", "left", "center"),
+            (180, "back", "center", "bottom"), (270, "right", "right", "center"),
+        ):  # fmt: skip
+            axes.text(*_around(degrees, 106), word, ha=across, va=upright)
+        return _svg(figure, title, "directions")
 
 
-def _label(value: float, digits: int) -> str:
-    """A number short enough for an axis: 0.005, 2,500, 20k, 1.5M."""
+@contextmanager
+def _axes(width: int, height: int, margins: tuple[int, int, int, int]) -> Generator[tuple[Figure, Axes]]:
+    """A figure whose units are the drawing's, with axes inside the margins (left, right, top, bottom)."""
+    left, right, top, bottom = margins
+    with matplotlib.style.context(["default", SETTINGS]):
+        figure = Figure((width / 72, height / 72), dpi=72, frameon=False)
+        inside = (left / width, bottom / height, 1 - (left + right) / width, 1 - (top + bottom) / height)
+        axes = figure.add_axes(inside, frameon=False)
+        axes.tick_params(which="both", length=0, pad=8)
+        axes.margins(0, 0.04)
+        axes.set_axisbelow(True)
+        axes.yaxis.set_gid("class:y-axis")
+        yield figure, axes
+
+
+def _curve(axes: Axes, points: np.ndarray, color: str, logarithmic: bool) -> None:
+    """One line; through the means of bins, over a band, where it has many points."""
+    if not len(points):
+        return
+    bins = np.array_split(points, min(len(points), BINS))
+    steps = [b[:, 0].mean() for b in bins]
+    # On a logarithmic axis the middle of what is seen is the mean of logarithms.
+    means = [np.exp(np.log(b[:, 1]).mean()) if logarithmic else b[:, 1].mean() for b in bins]
+    if len(points) > BINS:
+        low, high = ([f(b[:, 1]) for b in bins] for f in (np.min, np.max))
+        axes.fill_between(steps, low, high, color=color, alpha=0.16, linewidth=0, clip_on=False, gid="class:band")
+    marker = "o" if len(means) == 1 else ""
+    axes.plot(steps, means, color=color, linewidth=2, marker=marker, markersize=4, clip_on=False, gid="class:curve")
+
+
+def _ticks(axes: Axes, logarithmic: bool, whole: bool = False) -> None:
+    axes.xaxis.set_major_locator(MaxNLocator(7, steps=[1, 2, 2.5, 5, 10], integer=True, min_n_ticks=1))
+    if logarithmic:
+        low, high = axes.get_ylim()
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 300 * low else (1.0,), numticks=9))
+    else:
+        axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}" if whole else short(value)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+    axes.grid(axis="y")
+
+
+def short(value: float | int) -> str:
+    """A number short enough for an axis.
+
+    >>> [short(v) for v in (0.000025, 0.005, 2500.0, 20000.0, 1500000.0)]
+    ['2.5e-05', '0.005', '2,500', '20k', '1.5M']
+    """
+    if 0 < abs(value) < 1e-3:
+        return f"{value:.3g}" if abs(value) < 1e-4 else f"{value:g}"
     for unit, name in ((1e6, "M"), (1e4, "k")):
         if abs(value) >= unit:
-            return f"{value / (1e6 if name == 'M' else 1e3):,.{digits}g}{name}"
-    return f"{value:,.{digits}g}"
+            return f"{value / (1e6 if name == 'M' else 1e3):,.6g}{name}"
+    return f"{value:,.6g}"
 
 
-def _points(curve: Curve, logarithmic: bool) -> np.ndarray:
-    """(step, value or its logarithm) of what can be drawn."""
+def _finite(curve: Curve, logarithmic: bool) -> np.ndarray:
+    """(step, value) of what can be drawn."""
     points = np.array([curve.steps, curve.values], dtype=float).T.reshape(-1, 2)
     points = points[np.isfinite(points).all(1)]
-    if logarithmic:
-        points = points[points[:, 1] > 0]
-        points[:, 1] = np.log10(points[:, 1])
-    return points
+    return points[points[:, 1] > 0] if logarithmic else points
 
 
-def _listed(points: np.ndarray) -> str:
-    return " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+def _filled(patch: Patch, color: str, alpha: float = 1.0) -> Patch:
+    patch.set(facecolor=COLORS[color], linewidth=0, alpha=alpha)
+    return patch
+
+
+def _around(degrees: float | int, radius: int) -> tuple[float, float]:
+    angle = math.radians(degrees)
+    return radius * math.sin(angle), -radius * math.cos(angle)
+
+
+def _svg(figure: Figure, label: str, kind: str, tooltips: Sequence[Sequence[str]] = ()) -> str:
+    """The drawing as an element to be put into a page.
+
+    Ids that nothing refers to are taken out, for a page holds several drawings; the others are made from what they
+    stand for, so the same id twice means the same thing. "class:a b" as an artist's id becomes its classes.
+    """
+    stored = io.StringIO()
+    figure.savefig(stored, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
+    root = ElementTree.fromstring(stored.getvalue())
+    referred = set(re.findall(r"""(?:url\(|href=")#([^)"]+)""", stored.getvalue()))
+    for element in root.iter():
+        _cleaned(element, referred)
+    for i, texts in enumerate(tooltips):
+        (group,) = (g for g in root.iter("g") if g.get("class") == f"dots s{i}")
+        for mark, text in zip(group.iter("use"), texts, strict=True):
+            ElementTree.SubElement(mark, "title").text = text
+    view = root.attrib["viewBox"]
+    root.attrib.clear()
+    root.attrib.update({"viewBox": view, "class": kind, "role": "img", "aria-label": label})
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _cleaned(element: Any, referred: set[str]) -> None:
+    """Without namespaces, with the page's colours, and with an id only where it is referred to."""
+    element.tag = element.tag.rpartition("}")[2]
+    for name, value in list(element.attrib.items()):
+        del element.attrib[name]
+        plain = name.rpartition("}")[2]
+        if plain == "id" and value.startswith("class:"):
+            element.set("class", value.removeprefix("class:"))
+        elif plain == "style":
+            style = re.sub(r"font-family: [^;]*; ", "", value)
+            element.set(plain, re.sub(r"#0000([0-9a-f]{2})", lambda m: f"var(--{NAMES[int(m[1], 16) - 1]})", style))
+        elif plain != "id" or value in referred:
+            element.set(plain, value)
+    element.tail = None
+    if element.tag != "text":
+        element.text = None
