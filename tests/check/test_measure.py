@@ -50,12 +50,12 @@ def test_a_good_capture_ends_well_and_leaves_page_and_numbers(turner, capsys):
     assert validate(turner) == []
 
 
-def test_a_wasted_capture_ends_with_one(turner, capsys, tmp_path):
+def test_a_capture_that_is_not_trainable_ends_with_one(turner, capsys, tmp_path):
     each_mask(turner, lambda mask, time: 255 - mask)
     code, said = checked(capsys, turner, "--out", tmp_path / "page", "--most", 8)
     assert code == 1
     assert "fault: 8 masks inverted" in said
-    assert "waste of time" in said
+    assert "Not trainable as it is" in said
     assert f"twofold train {turner}" not in said
     assert not (turner / "check").exists()
     assert "Not trainable" in (tmp_path / "page" / "index.html").read_text()

@@ -118,8 +118,8 @@ def test_what_makes_training_a_waste_of_time(good, topic):
     verdict = judge(SERIOUS[topic](good))
     assert verdict.findings[0].level == "fault"
     assert topic in {f.topic for f in verdict.findings if f.level == "fault"}
-    assert verdict.level == "waste"
-    assert "waste of time" in verdict.words
+    assert verdict.level == "not trainable"
+    assert "Not trainable" in verdict.words
 
 
 def test_units_are_recognised_by_the_height(good):
@@ -195,5 +195,5 @@ def test_findings_come_worst_first_and_read_as_sentences():
     note, fault = Finding("note", "a", "That", "Leave it."), Finding("fault", "b", "This", "Mend it.", "times 3")
     assert str(fault) == "This (times 3). Mend it."
     assert str(note) == "That. Leave it."
-    assert Judgement((fault, note)).words == "Training on this would be a waste of time: 1 fault to mend first."
+    assert Judgement((fault, note)).words == "Not trainable as it is: 1 fault to fix first."
     assert Judgement((Finding("warning", "c", "", ""),) * 2).words == "Usable, with 2 warnings."

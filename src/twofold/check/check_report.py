@@ -35,7 +35,7 @@ OUTLINE = (255, 255, 70)
 """Of the mask."""
 GOOD_IOU = 0.8
 """What the fits of real people that trained well reach on average."""
-WORDS = {"good": "Good", "usable": "Usable", "waste": "Not trainable"}
+WORDS = {"good": "Good", "usable": "Usable", "not trainable": "Not trainable"}
 SIDES: dict[str, Literal["left", "right"]] = {"left": "left", "right": "right"}
 
 

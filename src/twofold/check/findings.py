@@ -16,7 +16,7 @@ class Finding:
     """Something worth knowing about a capture.
 
     Attributes:
-        level: a fault makes training a waste of time, a warning costs quality, a note is for information.
+        level: a fault makes a capture not trainable, a warning costs quality, a note is for information.
         topic: short, the same in every version.
         what: a sentence.
         where: cameras and moments; empty for the whole capture.
@@ -41,10 +41,10 @@ class Judgement:
     findings: tuple[Finding, ...]
 
     @property
-    def level(self) -> Literal["good", "usable", "waste"]:
+    def level(self) -> Literal["good", "usable", "not trainable"]:
         """Of the whole capture."""
         levels = {finding.level for finding in self.findings}
-        return "waste" if "fault" in levels else "usable" if "warning" in levels else "good"
+        return "not trainable" if "fault" in levels else "usable" if "warning" in levels else "good"
 
     @property
     def words(self) -> str:
@@ -54,7 +54,7 @@ class Judgement:
             return "Good: nothing speaks against training."
         if self.level == "usable":
             return f"Usable, with {counted(count['warning'], 'warning')}."
-        return f"Training on this would be a waste of time: {counted(count['fault'], 'fault')} to mend first."
+        return f"Not trainable as it is: {counted(count['fault'], 'fault')} to fix first."
 
 
 def graded(serious: bool) -> Level:

@@ -119,7 +119,7 @@ def check(
     out: Path | None = None,
     most: int = 100,
 ) -> None:
-    """Says whether a capture is worth training on, and what to mend; exit code 1 where training would be wasted.
+    """Check whether a capture is worth training on, and report what to fix; exit code 1 where it is not trainable.
 
     Args:
         capture: Capture folder.
@@ -140,7 +140,7 @@ def check(
     for finding in judgement.findings:
         console().print(f"{finding.level}: {finding}", soft_wrap=True)
     console().print(judgement.words, soft_wrap=True)
-    wasted = judgement.level == "waste"
-    say(f"The report is {page}.", "mend what it names and check again" if wasted else f"twofold train {capture}")
-    if wasted:
+    untrainable = judgement.level == "not trainable"
+    say(f"The report is {page}.", "fix what it names and check again" if untrainable else f"twofold train {capture}")
+    if untrainable:
         sys.exit(1)
