@@ -1,4 +1,4 @@
-"""Configurations: there and back, overrides, and what a slip of the pen is told."""
+"""Configurations: to JSON and back, overrides, and the messages for mistyped settings."""
 
 import dataclasses
 import json

@@ -2,6 +2,12 @@
 
 A configuration may hold None, booleans, numbers, text, paths, `Literal`s, tuples, other dataclasses and unions of
 these. Where a field may be one of several dataclasses, the stored dictionary names its class under the key "kind".
+
+Why no library does this: both that were tried on the cases of `tests/test_config.py` need as much code around them.
+cattrs 26.2 reads true as 1, 1.5 as 1, "7" as 7 and NaN as a number unless every scalar has a hook of its own, knows no
+union of dataclasses with plain values, and gives a tree of exceptions that has to be searched for the path, the value
+and what would be allowed: 86 lines in place of 84. dacite 1.9 cannot choose a union's class by its "kind" (it takes the
+first that fits), and names a union's whole dictionary instead of the setting that is wrong.
 """
 
 import ast
@@ -92,7 +98,7 @@ def describe(config: object) -> list[str]:
 
 
 def require_within(config: object, **limits: tuple[int | float, int | float]) -> None:
-    """Refuses settings outside the least and the most that make sense; None passes, lists are held to it one by one.
+    """Refuses settings outside their limits (minimum, maximum); None passes, each element of a list is checked.
 
     >>> @dataclasses.dataclass(frozen=True)
     ... class Training:
@@ -107,13 +113,13 @@ def require_within(config: object, **limits: tuple[int | float, int | float]) ->
         ValueError: one or several are outside; all are named.
     """
     wrong = []
-    for name, (least, most) in limits.items():
+    for name, (low, high) in limits.items():
         value = getattr(config, name)
         numbers = value if isinstance(value, tuple) else () if value is None else (value,)
-        if not all(least <= number <= most for number in cast(tuple[int | float, ...], numbers)):
+        if not all(low <= number <= high for number in cast(tuple[int | float, ...], numbers)):
             text = _shown(value)
             given = text if len(text) <= 40 else f"{text[:30]}..."
-            wrong.append(f"{name}={given} should be {_plain(least)} to {_plain(most)}")
+            wrong.append(f"{name}={given} should be {_plain(low)} to {_plain(high)}")
     if wrong:
         raise ValueError("; ".join(wrong))
 
