@@ -90,3 +90,25 @@ def test_progress_goes_to_the_end_and_no_further(trained, tmp_path):
     assert all(before < 1 for before in shares[:-1])
     sections = {name for name in metrics if name != "pose_refinement"}
     assert {what for _, what in told} == sections | {"pose refinement"}
+
+
+def test_by_default_a_long_split_is_sampled_evenly_and_the_protocol_says_so(capture, monkeypatch, tmp_path):
+    seen = []
+
+    def drawn(avatar, capture, frame, refined):
+        seen.append(frame.time)
+        image, mask = evaluate.truth(frame, capture.background)
+        return Picture(image, mask, depth=mask, normal=image, base=image, base_normal=image)
+
+    monkeypatch.setattr(evaluate, "draw_frame", drawn)
+    frame = capture.splits["novel_pose"][1]
+    long = replace(capture, splits={**capture.splits, "novel_pose": tuple(replace(frame, time=t) for t in range(300))})
+    metrics = evaluate.evaluate(Mock(spec=Avatar), long, tmp_path)
+    held_out = seen[:-1]
+    assert (len(held_out), held_out[0], held_out[-1]) == (30, 0, 299)
+    assert set(np.diff(held_out)) <= {10, 11}
+    assert metrics["novel_pose"]["protocol"]["frames"].startswith("mean over 30 of 300 images, evenly spread, of the")
+    assert metrics["train"]["protocol"]["frames"].startswith("mean over all 1 images of the split train")
+    seen.clear()
+    evaluate.evaluate(Mock(spec=Avatar), long, tmp_path, most=None)
+    assert len(seen) == 301

@@ -88,9 +88,9 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 @posix_only
 def test_leftovers_of_killed_programs_go_and_those_of_running_ones_stay(tmp_path):
     dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
-    orphan = tmp_path / f".a.partial-{int(dead.stdout)}-0123.bin"
-    alive = tmp_path / f".a.partial-{os.getpid()}-0123.bin"
-    other = tmp_path / f".b.partial-{int(dead.stdout)}-0123.bin"
+    orphan = tmp_path / f".a.partial-{int(dead.stdout)}-01234567.bin"
+    alive = tmp_path / f".a.partial-{os.getpid()}-01234567.bin"
+    other = tmp_path / f".b.partial-{int(dead.stdout)}-01234567.bin"
     for path in (orphan, alive, other):
         path.write_bytes(b"half")
     write_bytes(tmp_path / "a.bin", b"whole")
@@ -100,12 +100,39 @@ def test_leftovers_of_killed_programs_go_and_those_of_running_ones_stay(tmp_path
 @posix_only
 def test_a_killed_folder_is_swept_up_by_the_next_try(tmp_path):
     dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
-    orphan = tmp_path / f"out.partial-{int(dead.stdout)}-0123"
+    orphan = tmp_path / f"out.partial-{int(dead.stdout)}-01234567"
     orphan.mkdir()
     (orphan / "half.png").write_bytes(b"half")
     with new_folder(tmp_path / "out") as folder:
         (folder / "whole.png").write_bytes(b"whole")
     assert os.listdir(tmp_path) == ["out"]
+
+
+@posix_only
+def test_folders_and_files_of_the_user_that_only_look_like_leftovers_stay(tmp_path):
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    number = int(dead.stdout)
+    folders = [f"out.partial-{number}", f"out.partial-{number}-spring", f"out.partial-{number}-01234567-mine"]
+    files = [f".a.partial-{number}.bin", f".a.partial-{number}-12345678.old.bin", f".a.partial-{number}-1234567.bin"]
+    for name in folders:
+        (tmp_path / name).mkdir()
+    for name in files:
+        (tmp_path / name).write_bytes(b"mine")
+    with new_folder(tmp_path / "out"):
+        pass
+    write_bytes(tmp_path / "a.bin", b"whole")
+    assert set(os.listdir(tmp_path)) == {"out", "a.bin", *folders, *files}
+
+
+def test_of_two_programs_that_fill_one_folder_the_second_keeps_what_the_first_has_made(tmp_path):
+    second = new_folder(tmp_path / "out")
+    (second.__enter__() / "b").write_bytes(b"second")
+    with new_folder(tmp_path / "out") as first:
+        (first / "a").write_bytes(b"first")
+    with pytest.raises(TwofoldError, match=f"Another program has filled the folder {tmp_path / 'out'}"):
+        second.__exit__(None, None, None)
+    assert os.listdir(tmp_path) == ["out"]
+    assert os.listdir(tmp_path / "out") == ["a"]
 
 
 @posix_only

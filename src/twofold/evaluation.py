@@ -16,6 +16,7 @@ from twofold.methods.base import Avatar, PosedAvatar
 from twofold.metrics import image as image_metrics
 from twofold.metrics import shape as shape_metrics
 from twofold.outputs.mesh import extract_surface, pose_surface
+from twofold.outputs.shares import Shares
 from twofold.outputs.views import Picture, draw
 
 
@@ -27,8 +28,10 @@ def truth(frame: Frame, background: tuple[float, float, float]) -> tuple[Tensor,
 
 NEAR = 0.5
 """Seconds over which the errors of an estimator's poses last."""
-_MESH = 4
-"""Pictures that can be measured while one surface is."""
+_MESH = 4.0
+"""Images that can be measured while one surface is; a first guess, until one has been."""
+MAX_IMAGES = 30
+"""Images a split that are measured unless more are asked for, evenly spread: a minute or two on two cores."""
 
 
 def draw_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) -> Picture:
@@ -70,6 +73,15 @@ def pose_at(avatar: Avatar, capture: Capture, frame: Frame) -> PosedAvatar:
     return avatar.pose(pose, translation, None)
 
 
+def sampled(count: int, of: int, what: str) -> str:
+    """How many of how many were measured, for protocols and the command line.
+
+    >>> sampled(30, 412, "images"), sampled(7, 7, "images")
+    ('30 of 412 images, evenly spread,', 'all 7 images')
+    """
+    return f"all {count} {what}" if count == of else f"{count} of {of} {what}, evenly spread,"
+
+
 def measure_split(
     avatar: Avatar, capture: Capture, split: str, most: int | None = None, refined: bool = False,
     watch: Callable[[Frame, Picture], None] | None = None,
@@ -102,7 +114,8 @@ def measure_split(
     cameras = len({frame.camera_name for frame in frames})
     protocol = {
         **image_metrics.PROTOCOLS,
-        "frames": f"mean over {len(frames)} pictures of the split {split}: {times} moments, {cameras} cameras",
+        "frames": f"mean over {sampled(len(frames), len(capture.splits[split]), 'images')} of the split {split}: "
+        f"{times} moments, {cameras} cameras",
         "poses": poses,
         "background": f"constant {capture.background}",
     }
@@ -140,7 +153,7 @@ def measure_geometry(
         **shape_metrics.PROTOCOLS,
         "surface": f"marching cubes of the signed distance at {1000 * voxel:g} mm in canonical space, largest piece, "
         "posed by the 7 nearest body vertices",
-        "moments": f"mean over {len(rows)} moments with a true mesh",
+        "moments": f"mean over {sampled(len(rows), len(_with_mesh(capture, None)), 'moments with a true mesh')}",
     }
     return means
 
@@ -172,7 +185,7 @@ def measure_refinement(
 
 
 def evaluate(
-    avatar: Avatar, capture: Capture, folder: Path, most: int | None = None, meshes: int | None = 4,
+    avatar: Avatar, capture: Capture, folder: Path, most: int | None = MAX_IMAGES, meshes: int | None = 4,
     show: Callable[[float, str], None] | None = None, extra: dict[str, object] | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """Measures everything that the capture knows the truth of and writes `metrics.json` into the run.
@@ -181,8 +194,8 @@ def evaluate(
         avatar: to measure.
         capture: with the truth.
         folder: the run.
-        most: at most so many pictures a split.
-        meshes: at most so many true meshes.
+        most: at most so many images a split, evenly spread; None for all.
+        meshes: at most so many true meshes, evenly spread; None for all.
         show: told the share that is done and what is being measured.
         extra: further sections for the file.
 
@@ -196,14 +209,14 @@ def evaluate(
     pictures["train"] = len(spread(capture.train, few))
     # Training pictures are drawn once more, in the poses as given; held-out ones in both.
     refined = pictures["train"] + 2 * min(pictures["novel_pose"], few) if _refines(avatar) else 0
-    to_do = sum(pictures.values()) + refined + _MESH * len(_with_mesh(capture, meshes))
-    done = 0
+    pieces = {**pictures, "pose refinement": refined, "geometry": len(_with_mesh(capture, meshes))}
+    section = ""
+    shares = Shares(pieces, {"geometry": _MESH}, lambda share: show(share, section) if show else None)
 
-    def watch(what: str, pictures: int = 1) -> None:
-        nonlocal done
-        done += pictures
-        if show:
-            show(done / max(to_do, 1), what)
+    def watch(what: str) -> None:
+        nonlocal section
+        section = what
+        shares.done(what)
 
     metrics: dict[str, object] = {}
     for split in ("novel_view", "novel_pose"):
@@ -211,7 +224,7 @@ def evaluate(
         if part:
             metrics[split] = part
     metrics["train"] = trained = measure_split(avatar, capture, "train", few, True, lambda f, p: watch("train"))
-    geometry = measure_geometry(avatar, capture, meshes, watch=lambda: watch("geometry", _MESH))
+    geometry = measure_geometry(avatar, capture, meshes, watch=lambda: watch("geometry"))
     if geometry:
         metrics["geometry"] = geometry
     if isinstance(getattr(avatar, "refinement", None), PoseRefinement):

@@ -9,6 +9,7 @@ import errno
 import io
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Generator
@@ -30,6 +31,7 @@ _ADVICE = {
     errno.ENOTDIR: "a part of this path is a file, expected a folder; choose another name",
     errno.EEXIST: "a file stands there, expected a folder; choose another name",
     errno.ENOENT: "the folder it should lie in does not exist; make that first or correct the path",
+    errno.ENOTEMPTY: "another program is filling that folder; choose another name",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
 }
 
@@ -114,6 +116,8 @@ def new_folder(path: Path | str, replace: bool = False) -> Generator[Path, None,
             _remove_orphans(target.parent, prefix)
             temporary.mkdir()
             yield temporary
+            if not replace and target.is_dir() and any(target.iterdir()):
+                raise TwofoldError(f"Another program has filled the folder {path} meanwhile; choose another name.")
             _put_in_place(temporary, target)
         except BaseException as error:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -202,12 +206,13 @@ def _flush_to_disk(path: Path) -> None:
 
 
 def _remove_orphans(folder: Path, prefix: str, suffix: str = "") -> None:
-    """Removes what killed programs left half-written in `folder`; what running ones write stays."""
+    """Removes what killed programs left half-written in `folder`; what running ones write, and all else, stays."""
     if os.name == "nt":  # where asking whether a process lives would end it
         return
+    own = re.compile(re.escape(prefix) + "([0-9]+)-[0-9a-f]{8}" + re.escape(suffix))
     for name in os.listdir(folder):
-        process = name[len(prefix) :].partition("-")[0]
-        if name.startswith(prefix) and name.endswith(suffix) and process.isdigit() and not _is_running(int(process)):
+        found = own.fullmatch(name)  # a user's own `out.partial-2019` is none of these
+        if found and not _is_running(int(found[1])):
             orphan = folder / name
             if orphan.is_dir():
                 shutil.rmtree(orphan, ignore_errors=True)
@@ -234,8 +239,8 @@ def _make_parents(path: Path) -> list[Path]:
 
 
 def _put_in_place(temporary: Path, target: Path) -> None:
-    if not target.exists():
-        os.replace(temporary, target)
+    if not target.exists() or (os.name != "nt" and not any(target.iterdir())):
+        os.replace(temporary, target)  # fails where somebody fills an empty folder at this moment
         return
     old = target.with_name(f"{target.name}.replaced-{secrets.token_hex(4)}")
     os.replace(target, old)

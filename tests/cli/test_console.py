@@ -27,3 +27,37 @@ def test_a_line_tells_of_slow_progress_now_and_then_and_how_long_it_will_take(
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 33
     assert lines[-1].startswith("Working: 10 %, 2:30:")
+
+
+def test_what_stands_still_takes_ever_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    left = console.TimeLeft()
+    assert left.seconds() is None
+    for step in range(100):
+        left.note(step / 100)
+        now += 1
+    assert left.seconds() == pytest.approx(1, abs=0.5)
+    now += 200
+    seconds = left.seconds()
+    assert seconds is not None
+    assert seconds > 2
+    left.note(1.0)
+    assert left.seconds() is None
+
+
+def test_the_time_left_follows_the_speed_of_late_and_starts_where_a_resumed_run_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = 0.0
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    left = console.TimeLeft()
+    for step in range(5000, 6000):  # of 10,000: one a second, then ten times as slow
+        left.note(step / 10_000)
+        now += 1
+    assert left.seconds() == pytest.approx(4000, rel=0.05)
+    for step in range(6000, 6200):
+        left.note(step / 10_000)
+        now += 10
+    assert left.seconds() == pytest.approx(38_000, rel=0.25)
+    assert len(left._past) < 1200

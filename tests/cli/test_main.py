@@ -13,10 +13,12 @@ from command_line import files, refused
 from PIL import Image
 from tiny_person import Run
 
+from twofold import __version__
 from twofold.cli.main import main
 from twofold.config import with_overrides
 from twofold.methods.table import RECIPES
 from twofold.metrics import perceptual
+from twofold.training.lock import locked
 from twofold.training.run import read_checkpoint
 
 
@@ -152,6 +154,44 @@ def test_a_demo_does_not_take_the_place_of_a_file(tmp_path: Path, capsys: pytest
     assert (tmp_path / "file").read_text() == "mine"
 
 
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--version"])
+    assert capsys.readouterr().out == f"twofold {__version__}\n"
+
+
+def test_options_keep_their_old_names_beside_the_new(
+    trained: Run, person_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[object, object]] = []
+
+    def measure(avatar: object, capture: object, run: object, most: object, meshes: object, show: object) -> dict:
+        asked.append((most, meshes))
+        return {}
+
+    monkeypatch.setattr("twofold.evaluation.evaluate", measure)
+    for words in (["--most", "3", "--meshes=2"], ["--max-images=3", "--max-meshes", "2"], ["--max-images", "all"], []):
+        main(["evaluate", str(trained.folder), *words])
+    assert asked == [(3, 2), (3, 2), (None, 4), (30, 4)]
+    assert "--max-images should be at least 1" in refused(capsys, "evaluate", trained.folder, "--most", 0)
+    assert "--max-images should be at least 2" in refused(capsys, "check", person_folder, "--most", 1)
+
+
+def test_a_run_that_is_being_trained_is_left_alone_before_any_work(
+    trained: Run,
+    person_folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = shutil.copytree(trained.folder, tmp_path / "run")
+    monkeypatch.setattr("twofold.capture.validate.validate", lambda _: pytest.fail("work was done"))
+    with locked(run):
+        assert f"{run} is being trained by another process" in refused(capsys, "train", "--resume", run)
+        (run / "checkpoint.safetensors").unlink()
+        assert f"{run} is being trained by another" in refused(capsys, "train", person_folder, "--out", run)
+    assert (run / "recipe.json").exists()
+
+
 def test_an_unknown_device_is_named(person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "nonsense" in refused(capsys, "train", person_folder, "--out", tmp_path / "run", "--device", "nonsense")
 
@@ -182,7 +222,7 @@ def test_a_run_is_trained_drawn_and_measured_and_each_command_says_where_and_wha
     moved = shutil.copytree(person_folder, tmp_path / "moved")
     main(["render", str(run), "--what", "views", "--capture", str(moved)])
     assert f"Next: twofold evaluate {run} --capture {moved}" in " ".join(capsys.readouterr().err.split())
-    main(["evaluate", str(run), "--most", "1", "--meshes", "0", "--capture", str(moved)])
+    main(["evaluate", str(run), "--max-images", "1", "--max-meshes", "0", "--capture", str(moved)])
     assert f"Next: twofold render {run} --capture {moved}" in " ".join(capsys.readouterr().err.split())
     assert "already holds a run" in refused(capsys, "train", person_folder, "--out", run)
 
@@ -249,7 +289,7 @@ def test_perceptual_weights_shape_the_training_but_are_not_stored_with_it(
     columns = {name: (tmp_path / name / "curves.csv").read_text().split()[0].split(",") for name in notes}
     assert set(columns["with"]) - set(columns["without"]) == {"lpips"}
     (tmp_path / "weights" / perceptual.VGG_FILE).unlink()
-    main(["evaluate", str(tmp_path / "with"), "--most", "1", "--meshes", "0"])
+    main(["evaluate", str(tmp_path / "with"), "--max-images", "1", "--max-meshes", "0"])
 
 
 @pytest.mark.parametrize("command", ["studio", "render"])

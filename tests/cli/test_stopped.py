@@ -92,7 +92,7 @@ def test_a_full_disk_ends_measuring_and_leaves_the_last_figures(
     (tmp_path / "run" / "metrics.json").write_text("{}")
     before = files(tmp_path)
     with files_end_at(100):
-        said = refused(capsys, "evaluate", tmp_path / "run", "--most", 1, "--meshes", 0)
+        said = refused(capsys, "evaluate", tmp_path / "run", "--max-images", 1, "--max-meshes", 0)
     assert f"Cannot write {tmp_path / 'run' / 'metrics.json'}" in said
     assert files(tmp_path) == before
     assert (tmp_path / "run" / "metrics.json").read_text() == "{}"

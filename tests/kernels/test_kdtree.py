@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from twofold.kernels.kdtree import denormals_kept, search_tree
+from twofold.kernels.kdtree import denormals_kept, query_nearest, search_tree
 
 TINY = 5e-324
 
@@ -55,3 +55,35 @@ def test_flushing_threads_get_the_same_answers(flushing):
     distance, _ = search_tree(points).query(points + 0.04, k=3)
     full = np.linalg.norm((points + 0.04)[:, None] - points, axis=-1)
     assert distance == pytest.approx(np.sort(full, 1)[:, :3])
+
+
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_searching_in_parts_finds_what_one_search_finds(k, threads):
+    random = np.random.default_rng(0)
+    points, sought = random.normal(size=(500, 3)), random.normal(size=(3000, 3))
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        distance, index = query_nearest(search_tree(points), sought, k)
+    finally:
+        torch.set_num_threads(before)
+    full = np.linalg.norm(sought[:, None] - points, axis=-1)
+    assert (index == np.argsort(full, 1)[:, :k]).all()
+    assert distance == pytest.approx(np.sort(full, 1)[:, :k])
+
+
+def test_a_search_that_is_interrupted_ends_before_its_process_does():
+    """SciPy's own threads run on after Ctrl-C and read the tree that the ending process has freed."""
+    script = (
+        "import numpy as np, signal, sys, threading, torch; from twofold.kernels.kdtree import *;"
+        "torch.set_num_threads(4); random = np.random.default_rng(0);"
+        "tree = search_tree(random.normal(size=(50_000, 3))); sought = random.normal(size=(400_000, 3));"
+        "threading.Timer(0.1, lambda: signal.raise_signal(signal.SIGINT)).start()\n"
+        "try: query_nearest(tree, sought, 7); print('too late')\n"
+        "except KeyboardInterrupt:\n"
+        "    assert not [t for t in threading.enumerate() if t.daemon]\n"
+        "    sys.exit(130)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")

@@ -17,6 +17,7 @@ from small_recipes import CASES
 from tiny_person import Run, tiny_recipe
 
 from twofold.capture.types import Capture
+from twofold.errors import TwofoldError
 from twofold.recipe import Recipe
 from twofold.training.loop import COMPILED, NOTHING_COMPILED, train
 from twofold.training.run import read_checkpoint
@@ -106,6 +107,23 @@ def test_a_run_without_a_checkpoint_yet_resumes_from_its_start(person: Capture, 
     assert_same(state(tmp_path / "whole"), state(tmp_path / "cut"))
 
 
+@pytest.mark.parametrize("resume", [False, True])
+def test_only_one_of_two_trainings_at_a_time_gets_the_folder(person: Capture, tmp_path: Path, resume: bool) -> None:
+    refused: list[str] = []
+
+    def again(progress: object) -> None:
+        if getattr(progress, "step", 0) == 2:
+            with pytest.raises(TwofoldError, match="is being trained by another process") as error:
+                train(person, replace(recipe_of(1), seed=5), tmp_path / "run", CPU, resume=resume)
+            refused.append(str(error.value))
+
+    train(person, recipe_of(4), tmp_path / "whole", CPU)
+    train(person, recipe_of(4), tmp_path / "run", CPU, watch=again)
+    assert str(tmp_path / "run") in refused[0]
+    assert_same(state(tmp_path / "whole"), state(tmp_path / "run"))
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {p.name for p in (tmp_path / "whole").iterdir()}
+
+
 def reached(folder: Path) -> int:
     """The step of the folder's checkpoint, which must be whole; 0 without one."""
     return read_checkpoint(folder)[1] if (folder / "checkpoint.safetensors").exists() else 0
@@ -187,7 +205,7 @@ COMPILING = """
 import sys, torch
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
-from train.test_loop import dense
+from training.test_loop import dense
 from twofold.capture.folder import read_capture
 from twofold.training.loop import train
 for choice in ("never", "always"):

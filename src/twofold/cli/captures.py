@@ -117,23 +117,23 @@ def prepare(
 def check(
     capture: Annotated[Path, tyro.conf.Positional],
     out: Path | None = None,
-    most: int = 100,
+    max_images: int = 100,
 ) -> None:
     """Check whether a capture is worth training on, and report what to fix; exit code 1 where it is not trainable.
 
     Args:
         capture: Capture folder.
         out: Folder for the report and its numbers; by default CAPTURE/check.
-        most: At most so many pictures are looked at, spread evenly.
+        max_images: Images looked at, evenly spread.
     """
     from twofold.check.check_report import require_no_file, write_check
     from twofold.check.measure import measure_capture
     from twofold.check.rules import judge
 
-    within(most=(most, 2, None))
+    within(max_images=(max_images, 2, None))
     require_no_file(out or capture / "check")
     with bar("Checking") as show:
-        facts, read = measure_capture(capture, most, lambda done: show(0.9 * done, ""))
+        facts, read = measure_capture(capture, max_images, lambda done: show(0.9 * done, ""))
         judgement = judge(facts)
         page = write_check(facts, read, judgement, out or capture / "check")
         show(1.0, "")

@@ -2,12 +2,15 @@
 
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from datetime import timedelta
+from typing import final
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from twofold.errors import TwofoldError
 
@@ -15,6 +18,47 @@ ALONE = os.environ.get("RANK", "0") == "0"
 """Of several processes that train together, the first one speaks for all."""
 LINE_EVERY = 30.0
 """Seconds after which progress is told anew where standard error is no terminal, and at every tenth of the way."""
+
+WINDOW = 60.0
+"""Seconds of the past that say how fast it goes, at least; of a long work, its later half."""
+
+
+@final
+class TimeLeft(ProgressColumn):
+    """How long it still takes, seconds: at the speed of the near past up to this moment.
+
+    Since the time that has passed without any news counts as well, what stands still takes ever longer, and does not
+    stay "1 second left".
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._past: deque[tuple[float, float]] = deque()
+        self._done = 0.0
+
+    def note(self, done: float) -> None:
+        """Takes down the share that is done."""
+        now = time.monotonic()
+        self._done = done
+        begun = self._past[0][0] if self._past else now
+        if not self._past or now - self._past[-1][0] >= max(0.5, (now - begun) / 500):
+            self._past.append((now, done))
+        while len(self._past) > 2 and self._past[1][0] <= now - max(WINDOW, (now - begun) / 2):
+            self._past.popleft()
+
+    def seconds(self) -> float | None:
+        """Seconds left; None while nobody knows."""
+        if not self._past:
+            return None
+        then, share = self._past[0]
+        if self._done <= share or self._done >= 1:
+            return None
+        return (1 - self._done) * (time.monotonic() - then) / (self._done - share)
+
+    def render(self, task: Task) -> Text:
+        """For the bar."""
+        left = self.seconds()
+        return Text("" if left is None else f"{timedelta(seconds=round(left))} left")
 
 
 def console() -> Console:
@@ -28,11 +72,12 @@ def bar(title: str) -> Generator[Callable[[float, str], None], None, None]:
 
     The function it gives takes the share that is done and a word about it.
     """
+    left = TimeLeft()
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
     out = console()
     with Progress(
-        *columns, TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
-        console=out, refresh_per_second=4, speed_estimate_period=60, disable=not out.is_terminal,
+        *columns, TimeElapsedColumn(), left, TextColumn("{task.fields[note]}"),
+        console=out, refresh_per_second=4, disable=not out.is_terminal,
     ) as progress:  # fmt: skip
         task = progress.add_task(title, total=1.0, note="")
         told, last = 0, time.monotonic()
@@ -40,12 +85,13 @@ def bar(title: str) -> Generator[Callable[[float, str], None], None, None]:
         def show(done: float, note: str) -> None:
             nonlocal told, last
             progress.update(task, completed=done, note=note)
+            left.note(done)
             tenths, now = int(10 * done), time.monotonic()
             if out.is_terminal or (tenths == told and now - last < LINE_EVERY):
                 return
             told, last = tenths, now
-            left = progress.tasks[0].time_remaining
-            parts = [f"{100 * done:.0f} %", *([f"{timedelta(seconds=int(left))} left"] if left else []), note]
+            seconds = left.seconds()
+            parts = [f"{100 * done:.0f} %", *([f"{timedelta(seconds=round(seconds))} left"] if seconds else []), note]
             out.print(f"{title}: {', '.join(filter(None, parts))}", soft_wrap=True)
 
         yield show
@@ -65,4 +111,4 @@ def within(**options: tuple[int | None, int, int | None]) -> None:
     for name, (value, least, most) in options.items():
         if value is not None and (value < least or (most is not None and value > most)):
             limits = f"at least {least}" if most is None else f"{least} to {most}"
-            raise TwofoldError(f"--{name} should be {limits}; it is {value}.")
+            raise TwofoldError(f"--{name.replace('_', '-')} should be {limits}; it is {value}.")

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from twofold import __version__
 from twofold.cli.captures import check, import_capture, prepare, studio
 from twofold.cli.console import ALONE, bar, console, say, within
+from twofold.cli.streams import streams_that_never_fail
 from twofold.errors import TwofoldError
 
 if TYPE_CHECKING:
@@ -53,6 +55,7 @@ def train(
     from twofold.capture.validate import require, validate
     from twofold.outputs.gallery import save_preview
     from twofold.training import loop
+    from twofold.training.lock import require_unlocked
     from twofold.training.run import RECIPE, choose_device, find_capture, read_recipe
 
     if resume is None:
@@ -64,6 +67,8 @@ def train(
     else:
         chosen, folder = read_recipe(resume), resume
         source = find_capture(resume, capture, "twofold train CAPTURE --resume RUN")
+    if ALONE:
+        require_unlocked(folder)
     where = choose_device(device)
     require(validate(source), source)
     read = read_capture(source)
@@ -92,11 +97,7 @@ def _show_settings(recipe: Recipes, overrides: tuple[str, ...], seed: int) -> No
     from twofold.config import describe, with_overrides
     from twofold.methods.table import RECIPES
 
-    lines = describe(with_overrides(RECIPES[recipe](), [f"seed={seed}", *overrides]))
-    try:
-        print("\n".join(lines), flush=True)
-    except BrokenPipeError:  # whoever reads, `head` say, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    print("\n".join(describe(with_overrides(RECIPES[recipe](), [f"seed={seed}", *overrides]))))
 
 
 def _new_run(
@@ -163,8 +164,8 @@ def render(
 def evaluate(
     run: Annotated[Path, tyro.conf.Positional],
     capture: Path | None = None,
-    most: int | None = None,
-    meshes: int | None = 4,
+    max_images: int | Literal["all"] = 30,
+    max_meshes: int | Literal["all"] = 4,
     device: str = "auto",
 ) -> None:
     """Measures an avatar against what its capture knows to be true; writes RUN/metrics.json.
@@ -172,20 +173,21 @@ def evaluate(
     Args:
         run: Run folder.
         capture: Capture folder, if it has moved since training.
-        most: At most so many pictures a split; by default all.
-        meshes: At most so many true meshes.
+        max_images: Images measured of each split, evenly spread; all for all.
+        max_meshes: True meshes measured, evenly spread; all for all.
         device: auto, cpu, cuda or cuda:N.
     """
     from twofold.capture.folder import read_capture
     from twofold.evaluation import evaluate as measure
     from twofold.training.run import choose_device, find_capture, load, require_same
 
-    within(most=(most, 1, None), meshes=(meshes, 0, None))
+    images, meshes = (None if given == "all" else given for given in (max_images, max_meshes))
+    within(max_images=(images, 1, None), max_meshes=(meshes, 0, None))
     avatar, _ = load(run, choose_device(device))
     read = read_capture(find_capture(run, capture))
     require_same(run, read, motion=True)
     with bar("Measuring") as show:
-        metrics = measure(avatar, read, run, most, meshes, show)
+        metrics = measure(avatar, read, run, images, meshes, show)
     for section, values in metrics.items():
         if isinstance(values, dict):
             numbers = {k: v for k, v in values.items() if isinstance(v, float)}
@@ -235,6 +237,24 @@ def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     return chosen
 
 
+RENAMED = {
+    "check": {"--most": "--max-images"},
+    "evaluate": {"--most": "--max-images", "--meshes": "--max-meshes"},
+}
+"""Options that had another name in version 0.1.0 of some command; the old name still works."""
+
+
+def _renamed(words: Sequence[str]) -> list[str]:
+    """The words with the present names of options.
+
+    >>> _renamed(["evaluate", "run", "--most=5"])
+    ['evaluate', 'run', '--max-images=5']
+    """
+    names = RENAMED.get(words[0], {}) if words else {}
+    parts = (word.partition("=") for word in words)
+    return ["".join((names.get(name, name), sign, value)) for name, sign, value in parts]
+
+
 def _one_by_one(words: Sequence[str]) -> list[str]:
     """`--set a=1 b=2` as `--set a=1 --set b=2`, which is how the parser takes lists of any length."""
     spread: list[str] = []
@@ -249,11 +269,22 @@ def _one_by_one(words: Sequence[str]) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `twofold` command: exit code 0, 1 where a check fails, 2 for bad input, 130 after Ctrl-C."""
+    words = [*(sys.argv[1:] if arguments is None else arguments)]
+    with streams_that_never_fail():
+        _run(words)
+
+
+def _run(words: list[str]) -> None:
+    """One command from its words to its exit code."""
     try:
+        if words == ["--version"]:
+            print(f"twofold {__version__}")
+            return
         command = tyro.extras.subcommand_cli_from_dict(
             {name: _later(command) for name, command in COMMANDS.items()}, prog="twofold",
-            args=_one_by_one(sys.argv[1:] if arguments is None else arguments),
-            description="A video of a person goes in, an avatar comes out.", config=(tyro.conf.AvoidSubcommands,),
+            args=_one_by_one(_renamed(words)),
+            description="A video of a person goes in, an avatar comes out. --version prints the version.",
+            config=(tyro.conf.AvoidSubcommands,),
         )  # fmt: skip
         from twofold.kernels.runtime import tune_process
 

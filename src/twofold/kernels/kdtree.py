@@ -6,8 +6,10 @@ from collections.abc import Generator
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
+
+from twofold.kernels.parallel import in_parts
 
 
 @contextlib.contextmanager
@@ -33,3 +35,26 @@ def search_tree(points: Float[np.ndarray, "n d"], quick: bool = False) -> KDTree
     """
     with denormals_kept():
         return KDTree(points, balanced_tree=not quick, compact_nodes=not quick)
+
+
+def query_nearest(
+    tree: KDTree, points: Float[np.ndarray, "n d"], k: int
+) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]:
+    """Distances to the k nearest points of the tree and their indices, nearest first, on PyTorch's number of threads.
+
+    SciPy's own threads (`workers`) are left to themselves when Ctrl-C arrives: they go on while the interpreter takes
+    the tree away below them, and the process ends in a segmentation fault. Ours are waited for.
+
+    Args:
+        tree: see `search_tree`; holds at least k points.
+        points: to find the neighbours of.
+        k: how many.
+    """
+    distance, index = np.empty((len(points), k)), np.empty((len(points), k), np.int64)
+
+    def search(begin: int, end: int) -> None:
+        found = tree.query(points[begin:end], k=[*range(1, k + 1)])
+        distance[begin:end], index[begin:end] = found
+
+    in_parts(len(points), search)
+    return distance, index

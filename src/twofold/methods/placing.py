@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -11,7 +10,7 @@ from torch import Tensor
 from twofold.config import require_within
 from twofold.deform.skinning import to_canonical
 from twofold.geometry.cameras import Rays, clip_to_box
-from twofold.kernels.kdtree import search_tree
+from twofold.kernels.kdtree import query_nearest, search_tree
 from twofold.methods.base import PosedAvatar
 from twofold.sampling.error_bounded import ErrorBoundedSampler
 from twofold.sampling.sdf_grid import DistanceTable
@@ -193,10 +192,8 @@ def place_error_bounded(
     tree = search_tree(posed.body.vertices.detach().cpu().numpy())
 
     def nearest_to(points: Tensor) -> tuple[Tensor, Tensor]:
-        away, index = tree.query(points.detach().cpu().numpy(), k=neighbours, workers=-1)
-        found = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), neighbours))
-        apart = torch.from_numpy(np.asarray(away, dtype=np.float32).reshape(len(points), neighbours))
-        return found.to(points.device), apart.to(points.device)
+        away, index = query_nearest(tree, points.detach().cpu().numpy(), neighbours)
+        return torch.from_numpy(index).to(points.device), torch.from_numpy(away).float().to(points.device)
 
     def sdf(points: Tensor) -> Tensor:
         index, apart = nearest_to(points)

@@ -1,7 +1,9 @@
 """The pictures that show a run: orbit, unseen views, unseen poses, canonical front and back."""
 
-from collections.abc import Callable, Iterator
+import functools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -14,9 +16,14 @@ from twofold.errors import TwofoldError
 from twofold.files import plain_errors, write_atomically
 from twofold.methods.base import Avatar, PosedAvatar
 from twofold.metrics.image import subject_box
+from twofold.outputs.shares import Shares
 from twofold.outputs.sheets import as_bytes, color_normals, residual_picture, sheet
 from twofold.outputs.video import write_video
 from twofold.outputs.views import Picture, draw, orbit, pose_canonically
+
+Item = TypeVar("Item")
+_ROWS = 5
+"""Frames of a split beside the truth."""
 
 
 def save_png(path: Path, image: UInt8[np.ndarray, "h w *c"]) -> None:
@@ -74,8 +81,9 @@ def shown_truth(frame: Frame, background: Float[Tensor, "3"]) -> Float[Tensor, "
 
 
 def comparison(
-    avatar: Avatar, capture: Capture, frames: list[Frame], chunk: int | None = None
-) -> UInt8[np.ndarray, "h w 3"]:
+    avatar: Avatar, capture: Capture, frames: list[Frame], chunk: int | None = None,
+    drawn: Callable[[], None] | None = None,
+) -> UInt8[np.ndarray, "h w 3"]:  # fmt: skip
     """A sheet with a row for each frame: the truth beside all panels, cut to the person."""
     rows: list[list[UInt8[np.ndarray, "h w 3"]]] = []
     labels: list[str] = []
@@ -87,6 +95,8 @@ def comparison(
         where = _around(frame.mask())
         rows.append([part[where] for part in parts.values()])
         labels.append(f"{frame.camera_name} {frame.time}")
+        if drawn:
+            drawn()
     return sheet(rows, labels, columns)
 
 
@@ -151,29 +161,61 @@ def render_run(
             "draw the orbit or the canonical pose instead."
         )
     background = _background(capture)
+    shares = Shares(*_pieces(capture, what, size, views), show)
+
+    def counted(kind: str, pictures: Iterable[Item]) -> Iterator[Item]:
+        for picture in pictures:
+            shares.done(kind)
+            yield picture
+
     if what in ("all", "canonical"):
         posed = pose_canonically(avatar)
-        parts = [panels(draw(avatar, posed, camera, background, chunk)) for camera in orbit(posed, size, 2)]
+        drawn = (draw(avatar, posed, camera, background, chunk) for camera in orbit(posed, size, 2))
+        parts = [panels(picture) for picture in counted("canonical", drawn)]
         save_png(folder / "canonical.png", sheet([list(p.values()) for p in parts], ["front", "back"], list(parts[0])))
-    show(0.1)
     for part, split in splits.items():
         if what in ("all", part) and capture.splits.get(split):
-            frames = spread(capture.splits[split], 5)
-            save_png(folder / f"{split}.png", comparison(avatar, capture, frames, chunk))
+            frames = spread(capture.splits[split], _ROWS)
+            rows = comparison(avatar, capture, frames, chunk, functools.partial(shares.done, part))
+            save_png(folder / f"{split}.png", rows)
             if split == "novel_pose":
-                write_video(folder / "novel_pose.mp4", motion_frames(avatar, capture, split, size, chunk), 12)
-        show(0.3)
+                moving = motion_frames(avatar, capture, split, size, chunk)
+                _write_film(folder / "novel_pose.mp4", counted("motion", moving))
     if what in ("all", "orbit"):
         frame = capture.train[0]
         posed = avatar.pose(frame.pose, frame.translation, frame.time)
 
         def turning() -> Iterator[np.ndarray]:
             pictures = orbit_frames(avatar, posed, capture, size, views, scene_up(capture), chunk)
-            for view, picture in enumerate(pictures):
+            for view, picture in enumerate(counted("orbit", pictures)):
                 parts = panels(picture)
                 save_png(folder / "orbit" / f"{view:03d}.png", parts["full"])
-                show(0.3 + 0.7 * (view + 1) / views)
                 yield np.concatenate([parts["full"], parts["normals"]], 1)
 
-        write_video(folder / "orbit.mp4", turning(), 12)
-    show(1.0)
+        _write_film(folder / "orbit.mp4", turning())
+
+
+def _pieces(capture: Capture, what: str, size: int, views: int) -> tuple[dict[str, int], dict[str, float]]:
+    """How many pictures of each kind `render_run` draws, and their sizes beside each other, pixels."""
+    seen, posed = (capture.splits.get(split, ()) for split in ("novel_view", "novel_pose"))
+    moments = {frame.time: frame.camera for frame in posed}
+    counts = {
+        "canonical": (2 if what in ("all", "canonical") else 0, size * size),
+        "views": (min(len(seen), _ROWS) if what in ("all", "views") else 0, _pixels(seen)),
+        "poses": (min(len(posed), _ROWS) if what in ("all", "poses") else 0, _pixels(posed)),
+        "motion": (len(moments) if what in ("all", "poses") else 0, min(_pixels(posed), size * size)),
+        "orbit": (views if what in ("all", "orbit") else 0, size * size),
+    }
+    return {name: count for name, (count, _) in counts.items()}, {
+        name: float(area) for name, (_, area) in counts.items()
+    }
+
+
+def _pixels(frames: Sequence[Frame]) -> int:
+    return frames[0].camera.height * frames[0].camera.width if frames else 0
+
+
+def _write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
+    with plain_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_video(path, frames, 12)

@@ -13,7 +13,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from twofold.geometry.cameras import Rays, clip_to_box
-from twofold.kernels.kdtree import search_tree
+from twofold.kernels.kdtree import query_nearest, search_tree
 from twofold.kernels.parallel import in_parts
 from twofold.sampling import shell_kernels
 from twofold.volume.samples import Samples
@@ -81,7 +81,7 @@ def build_shell(
     centers = (low + (near + 0.5) * voxel).astype(np.float32)
     tree = search_tree(points, quick=True)
     listed = min(candidates, len(points))
-    distance, nearest = (np.reshape(a, (-1, listed)) for a in tree.query(centers, k=listed, workers=-1))
+    distance, index = query_nearest(tree, centers, listed)
     keep = distance[:, 0] <= radius + np.sqrt(3) / 2 * voxel
     row = -1 - np.maximum(away - reach, 0).astype(np.int32)
     row[tuple(near[keep].T)] = np.arange(keep.sum(), dtype=np.int32)
@@ -91,7 +91,7 @@ def build_shell(
         voxel=voxel,
         radius=radius,
         row=torch.as_tensor(row, device=device),
-        nearest=torch.as_tensor(nearest[keep].astype(np.int32), device=device),
+        nearest=torch.as_tensor(index[keep].astype(np.int32), device=device),
         vertices=vertices.detach().float(),
     )
 

@@ -23,6 +23,7 @@ from twofold.kernels.runtime import flush_denormals
 from twofold.methods.base import Avatar, Subject
 from twofold.recipe import Recipe, TrainingConfig
 from twofold.training.curves import Curves
+from twofold.training.lock import locked
 from twofold.training.pixels import PixelSource
 from twofold.training.processes import Team, joined
 from twofold.training.run import (
@@ -148,7 +149,7 @@ def train(
 
     Raises:
         TwofoldError: unusable settings, a checkpoint that does not fit, another capture than the run was begun with,
-            a loss that is not finite, an unwritable folder.
+            a loss that is not finite, an unwritable folder, another process that trains in it.
         KeyboardInterrupt: passed on after the state has been stored.
     """
     flush_denormals()
@@ -164,6 +165,9 @@ def train(
         if resume:
             require_same(folder, capture, motion=True)
         subject = read_subject(folder) if resume else Subject.of(capture)
+        begun = team.leads and folder.is_dir() and any(folder.iterdir())
+        if begun:
+            at_the_end.enter_context(locked(folder))
         if not resume and team.leads:
             require_free(folder)
         avatar = recipe.method.build(subject, recipe.seed).to(device)
@@ -176,6 +180,8 @@ def train(
                 say(note)
         if not resume and team.leads:
             start_folder(folder, recipe, subject, capture.folder, tuple(notes))
+            if not begun:
+                at_the_end.enter_context(locked(folder))
         optimizer = make_optimizer(avatar, config)
         start = _restore(folder, avatar, optimizer) if resume else 0
         margin = getattr(recipe.method.sampler, "radius", 0.3) + 0.02
