@@ -76,12 +76,37 @@ def test_soft_pixels_count_to_both_sides_by_their_shares():
     assert losses.mask(coverage, coverage).item() == 0
 
 
-def literal_s3im(color, truth, orders):
+def literal_hard_mask(opacity, coverage, singles):
+    """Ray by ray with labels; single pixels and patch pixels apart, halved."""
+    means = []
+    for group in (range(singles), range(singles, len(opacity))):
+        inside, outside = [], []
+        for ray in group:
+            label = math.floor(coverage[ray]) if ray < singles else math.ceil(coverage[ray])
+            (inside if label else outside).append(abs(opacity[ray] - label))
+        means.append(sum(inside) / max(len(inside), 1) + sum(outside) / max(len(outside), 1))
+    return (means[0] + means[1]) / 2
+
+
+@given(seed=st.integers(0, 999), singles=st.integers(1, 11))
+def test_hard_mask_is_the_ray_by_ray_loop_over_both_groups(seed, singles):
+    opacity, coverage = random(12, seed=seed), (4 * random(12, seed=seed + 1) - 1.5).clamp(0, 1)
+    exact = literal_hard_mask(opacity.tolist(), coverage.tolist(), singles)
+    assert losses.hard_mask(opacity, coverage, singles).item() == pytest.approx(exact, rel=1e-12)
+
+
+def test_hard_mask_without_patches_or_without_one_side_is_the_mean_of_what_is_there():
+    opacity, coverage = torch.tensor([0.25, 0.5]), torch.tensor([1.0, 1.0])
+    assert losses.hard_mask(opacity, coverage, 2).item() == pytest.approx(0.625)
+    assert losses.hard_mask(opacity, coverage, 0).item() == pytest.approx(0.625)
+
+
+def literal_s3im(color, truth, orders, center=1.5):
     """Window by window over the virtual picture, borders of zeros, as the term is described."""
     rays, order = len(color), [i for part in orders for i in part]
     height = math.isqrt(rays)
     width = len(order) // height
-    bell = [math.exp(-((i - 1.5) ** 2) / (2 * 1.5**2)) for i in range(4)]
+    bell = [math.exp(-((i - center) ** 2) / (2 * 1.5**2)) for i in range(4)]
     norm = sum(bell) ** 2
     values = []
     for channel in range(3):
@@ -108,19 +133,20 @@ def literal_s3im(color, truth, orders):
     return 1 - sum(values) / len(values)
 
 
+@pytest.mark.parametrize("center", [1.5, 2.0])
 @pytest.mark.parametrize("rays", [4, 36, 41])
-def test_s3im_is_the_window_by_window_loop(rays):
+def test_s3im_is_the_window_by_window_loop(rays, center):
     color, truth = random(rays, 3), random(rays, 3, seed=1)
     source = torch.Generator().manual_seed(3)
     orders = [list(range(rays)), *(torch.randperm(rays, generator=source).tolist() for _ in range(9))]
-    found = losses.s3im(color, truth, torch.Generator().manual_seed(3))
-    assert found.item() == pytest.approx(literal_s3im(color.tolist(), truth.tolist(), orders))
+    found = losses.s3im(color, truth, torch.Generator().manual_seed(3), center)
+    assert found.item() == pytest.approx(literal_s3im(color.tolist(), truth.tolist(), orders, center))
 
 
 def test_s3im_lays_576_rays_out_as_24_by_240(monkeypatch):
     seen = []
     original = losses._windowed_ssim
-    monkeypatch.setattr(losses, "_windowed_ssim", lambda a, b: (seen.append(a.shape), original(a, b))[1])
+    monkeypatch.setattr(losses, "_windowed_ssim", lambda a, b, c: (seen.append(a.shape), original(a, b, c))[1])
     losses.s3im(random(576, 3), random(576, 3, seed=1), torch.Generator().manual_seed(0))
     assert seen == [(3, 1, 24, 240)]
 

@@ -18,6 +18,8 @@ S3IM_WINDOW = 4
 """Pixels across the window of `s3im`, and between two windows."""
 S3IM_SIGMA = 1.5
 """Standard deviation of that window, pixels."""
+S3IM_CENTER = (S3IM_WINDOW - 1) / 2
+"""Middle of that window, pixels from its first one; the release has 2."""
 ENTROPY_OFFSET = 1e-6
 """Added inside the logarithms of `binarisation`."""
 SPARSE_CLEARANCE, SPARSE_EPOCHS = 0.05, 200
@@ -39,15 +41,25 @@ class LossConfig:
     common: float = 0.5
     lpips: float = 1.0
     lpips_start: int = 20_000
-    """First step with the perceptual term."""
+    """First step with the perceptual term; 20,001 in the release."""
+    lpips_dropout: float = 0.0
+    """Chance of each squared difference of features to be left out; 0.5 in the release."""
+    lpips_off_box: Literal["black", "picture"] = "black"
+    """What patches show where no ray meets the body's box: black on both sides, or, as released, the background where
+    the avatar is rendered and the picture where it is not."""
     mask: float = 0.1
-    mask_form: Literal["sides", "mean"] = "sides"
-    """"sides": inside and outside rays averaged apart, as released; "mean": plain mean."""
+    mask_form: Literal["sides", "mean", "hard"] = "sides"
+    """"sides": inside and outside rays averaged apart, a pixel on the edge by its parts; "mean": plain mean; "hard": as
+    released, with hard labels and averages of their own for patches."""
     s3im: float = 0.1
+    s3im_center: float = S3IM_CENTER
+    """Middle of the Gaussian window, pixels from its first one of four; 2 in the release."""
     eikonal_points: int = 512
     """Random canonical body vertices, each moved by a normal deviate."""
     eikonal_spread: float = 0.01
     """Standard deviation of that, metres."""
+    eikonal_replacement: bool = True
+    """Whether the same vertex may be drawn twice; the release draws without replacement."""
     reduction: Literal["mean", "sum"] = "mean"
     """Whether colour differences are averaged over rays and channels, as released, or summed, as printed."""
 
@@ -60,6 +72,7 @@ class LossConfig:
         require_within(
             self, reconstruction=(0, 1e6), eikonal=(0, 1e6), common=(0, 1e6), lpips=(0, 1e6), mask=(0, 1e6),
             s3im=(0, 1e6), lpips_start=(0, MOST_STEPS), eikonal_points=(1, 1_000_000), eikonal_spread=(0, 1),
+            s3im_center=(0, S3IM_WINDOW - 1), lpips_dropout=(0, 0.99),
         )  # fmt: skip
 
 
@@ -143,7 +156,39 @@ def mask(
     return _mean_over(difference, coverage) + _mean_over(difference, 1 - coverage)
 
 
-def s3im(color: Float[Tensor, "R 3"], truth: Float[Tensor, "R 3"], generator: torch.Generator) -> Float[Tensor, ""]:
+def hard_mask(opacity: Float[Tensor, "R"], coverage: Float[Tensor, "R"], singles: int) -> Float[Tensor, ""]:
+    r"""Mask term with hard labels, averaged apart for single pixels and for the pixels of patches, as released.
+
+    A single pixel is inside where the person covers all of it, a pixel of a patch where the person covers any of it.
+    With $I$ and $O$ the inside and outside rays of a group and $A$ the opacity, a group's term is
+
+    \[ \frac{1}{|I|} \sum_{r \in I} |A_r - 1| + \frac{1}{|O|} \sum_{r \in O} |A_r| \]
+
+    and the mean over the two groups is returned; an empty side counts zero, an empty group not at all.
+
+    >>> opacity, coverage = torch.tensor([0.5, 0.5, 0.5, 0.25]), torch.tensor([1.0, 0.5, 0.5, 0.0])
+    >>> hard_mask(opacity, coverage, 2)  # the groups have 0.5 + 0.5 and 0.5 + 0.25
+    tensor(0.8750)
+
+    Args:
+        opacity: rendered, 0..1.
+        coverage: share of the pixel that the person covers.
+        singles: how many of the rays are single pixels; they come first.
+    """
+    groups: list[Tensor] = []
+    for rays, inside in ((opacity[:singles], coverage[:singles] >= 1), (opacity[singles:], coverage[singles:] > 0)):
+        label = inside.to(opacity.dtype)
+        if len(rays):
+            groups.append(_mean_over((rays - 1).abs(), label) + _mean_over(rays.abs(), 1 - label))
+    return torch.stack(groups).mean()
+
+
+def s3im(
+    color: Float[Tensor, "R 3"],
+    truth: Float[Tensor, "R 3"],
+    generator: torch.Generator,
+    center: float = S3IM_CENTER,
+) -> Float[Tensor, ""]:
     """Structure beyond single pixels (S3IM, Xie et al. 2023): 1 - SSIM of a virtual picture made of unrelated rays.
 
     The rays, in order and then in nine random orders, fill the rows of a picture as high as the square root of their
@@ -154,6 +199,7 @@ def s3im(color: Float[Tensor, "R 3"], truth: Float[Tensor, "R 3"], generator: to
         color: rendered, 0..1.
         truth: of the picture, 0..1.
         generator: draws the orders.
+        center: middle of the Gaussian window, pixels from its first one of 0..3; the release has 2, off its centre.
     """
     rays = len(color)
     height = math.isqrt(rays)
@@ -166,7 +212,7 @@ def s3im(color: Float[Tensor, "R 3"], truth: Float[Tensor, "R 3"], generator: to
     width = len(order) // height
     order = order[: height * width]
     first, second = (c[order].T.reshape(3, 1, height, width) for c in (color, truth))
-    return 1 - _windowed_ssim(first, second).mean()
+    return 1 - _windowed_ssim(first, second, center).mean()
 
 
 def squared_error(color: Float[Tensor, "*b"], truth: Float[Tensor, "*b"]) -> Float[Tensor, ""]:
@@ -306,9 +352,9 @@ def _mean_over(values: Tensor, shares: Tensor) -> Tensor:
     return (values * shares).sum() / torch.where(whole > 0, whole, torch.ones_like(whole))
 
 
-def _windowed_ssim(first: Tensor, second: Tensor) -> Tensor:
+def _windowed_ssim(first: Tensor, second: Tensor, center: float) -> Tensor:
     """Structural similarity of pictures [n 1 h w] in each window; colours in 0..1."""
-    offsets = torch.arange(S3IM_WINDOW, dtype=first.dtype, device=first.device) - (S3IM_WINDOW - 1) / 2
+    offsets = torch.arange(S3IM_WINDOW, dtype=first.dtype, device=first.device) - center
     bell = torch.exp(-offsets.square() / (2 * S3IM_SIGMA**2))
     window = (bell[:, None] * bell / bell.sum() ** 2)[None, None]
 

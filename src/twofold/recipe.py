@@ -22,6 +22,16 @@ class PixelConfig:
     """Edge of a patch, pixels."""
     patch_on_subject: float = 0.9
     """Probability that a patch is centred on the subject."""
+    reachable: Literal["body", "box"] = "body"
+    """Pixels beside the subject: "body", near the body or the mask; "box", all whose rays meet the box of the joints of
+    the pose as given, as released."""
+    subject: Literal["half", "any"] = "half"
+    """Pixels of the subject: "half", those that it covers by more than half, in their whole bounding box; "any", as
+    released, those that it covers at all, in that box without its last row and column."""
+    replacement: bool = True
+    """Whether the same single pixel may be drawn twice; the release draws without replacement."""
+    rounded: bool = True
+    """Whether colours on the background are rounded to 8 bits, a quarter of the memory; not in the release."""
 
     def __post_init__(self) -> None:
         """Refuses choices with which no picture gives pixels, or more than any machine takes."""
@@ -46,6 +56,9 @@ class TrainingConfig:
     rate_pose: float = 5e-5
     milestones: tuple[int, ...] = (200, 400)
     """Epochs after which the rates are halved; an epoch sees every training picture once."""
+    epochs: Literal["images", "steps"] = "images"
+    """How long an epoch is: "images", as many pictures as there are, wherever in a step it ends; "steps", as released,
+    whole steps, the last one of which begins the pictures again where they do not come out even."""
     warmup: int = 0
     """Steps over which the rates rise from zero."""
     decay: float = 1.0

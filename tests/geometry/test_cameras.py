@@ -5,7 +5,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twofold.geometry.cameras import Camera, Rays, clip_to_box, pixel_grid, pixel_rays, project
+from twofold.geometry.cameras import (
+    Camera,
+    Rays,
+    clip_to_box,
+    pixel_grid,
+    pixel_rays,
+    project,
+    without_tiny_components,
+)
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigid_transform
 
 
@@ -98,3 +106,10 @@ def test_rays_can_be_picked_by_index():
     rays = pixel_rays(make_camera(), torch.rand(6, 2, dtype=torch.float64))
     assert len(rays) == 6
     assert torch.equal(rays[2:4].directions, rays.directions[2:4])
+
+
+def test_tiny_components_of_directions_become_the_released_constant_and_others_stay():
+    given = torch.tensor([[0.0, 9e-6, -9e-6], [-0.6, 1e-5, 0.8], [-2e-5, 0.0, -1.0]], dtype=torch.float64)
+    rays = Rays(torch.zeros(3, 3, dtype=torch.float64), given, torch.zeros(3), torch.ones(3))
+    expected = [[1e-5 if abs(d) < 1e-5 else d for d in row] for row in given.tolist()]
+    assert without_tiny_components(rays).directions.tolist() == expected

@@ -7,7 +7,6 @@ from small_recipes import CASES, LATE
 
 from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods.base import Subject
-from twofold.methods.factorized import PoseConfig
 from twofold.methods.placing import ShellSampler
 from twofold.metrics.perceptual import LPIPS
 from twofold.outputs.views import draw
@@ -51,36 +50,13 @@ def test_density_scale_never_falls_below_its_floor(subject, form):
         assert float(avatar.beta.detach()) >= 0.999e-3
 
 
-@pytest.fixture(scope="module")
-def telling(subject, person):
-    """A function that gives what the networks are told of a pose at a step."""
-    avatar = QUICK.build(subject)
-
-    def told(step, **options):
-        pose = PoseConfig(**({"zero_until": 0, "zero_every": 0} | options))
-        avatar.config = replace(avatar.config, pose=pose)
-        return avatar._condition(person.train[1].pose, step)
-
-    return told
-
-
-def test_pose_is_told_without_the_root_over_pi_or_as_it_is(telling, person):
-    angles = person.train[1].pose
-    torch.testing.assert_close(telling(None), angles[1:].flatten() / math.pi)
-    torch.testing.assert_close(telling(7, divide_by_pi=False, with_root=True), angles.flatten())
-
-
-def test_pose_is_kept_back_at_first_and_every_so_many_epochs_but_never_when_looking(telling):
-    options = {"zero_until": 10, "zero_every": 3}  # an epoch has five steps here
-    shown = [bool(telling(step, **options).any()) for step in range(35)]
-    assert shown == [step >= 10 and step // 5 % 3 != 0 for step in range(35)]
-    assert telling(None, **options).any()
-
-
-def test_pose_is_dropped_by_chance_as_often_as_asked_and_the_same_each_time(telling):
-    kept = [bool(telling(step, drop=0.2).any()) for step in range(1000)]
-    assert 0.16 < 1 - sum(kept) / 1000 < 0.24
-    assert kept == [bool(telling(step, drop=0.2).any()) for step in range(1000)]
+@pytest.mark.parametrize(("epochs", "length"), [("moments", 5), ("training", 3)])
+def test_epochs_of_the_zero_pose_are_moments_or_those_of_the_training(subject, person, epochs, length):
+    pose = replace(QUICK.pose, epochs=epochs, zero_until=10, zero_every=3, drop=0.0)
+    avatar = replace(QUICK, pose=pose).build(subject)
+    avatar.count_epochs(3)
+    shown = [bool(pose_of(avatar, person, step=step).condition.any()) for step in range(35)]
+    assert shown == [step >= 10 and step // length % 3 != 0 for step in range(35)]
 
 
 def test_poses_are_corrected_from_the_given_step_on_and_only_in_training_moments(subject, person):

@@ -45,8 +45,8 @@ def folder(published, tmp_path_factory):
     return folder
 
 
-def literal_lpips(first, second, vgg, linear):
-    """Layer by layer through torchvision's numbering, one picture at a time."""
+def literal_lpips(first, second, vgg, linear, kept=None):
+    """Layer by layer through torchvision's numbering, one picture at a time; `kept` is what a dropout of half keeps."""
 
     def features(picture):
         shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
@@ -65,7 +65,9 @@ def literal_lpips(first, second, vgg, linear):
 
     total = 0.0
     for i, (a, b) in enumerate(zip(features(first), features(second), strict=True)):
-        total += F.conv2d((a - b)[None].square(), linear[f"lin{i}.model.1.weight"]).mean().item()
+        squared = (a - b)[None].square()
+        squared = squared if kept is None else torch.where(kept[i], 2 * squared, 0)
+        total += F.conv2d(squared, linear[f"lin{i}.model.1.weight"]).mean().item()
     return total
 
 
@@ -75,6 +77,18 @@ def test_distance_is_the_layer_by_layer_reference(published, folder):
     found = model(first, second)
     for i in range(2):
         assert found[i].item() == pytest.approx(literal_lpips(first[i], second[i], *published), rel=1e-4)
+
+
+def test_dropout_leaves_out_half_of_the_squared_differences_and_doubles_the_rest(published, folder):
+    first, second = torch.rand(2, 3, 24, 24), torch.rand(2, 3, 24, 24)
+    found = load_lpips(folder)(first, second, 0.5, torch.Generator().manual_seed(5))
+    source = torch.Generator().manual_seed(5)
+    shapes = [(2, n, 24 // 2**i, 24 // 2**i) for i, n in enumerate((64, 128, 256, 512, 512))]
+    kept = [torch.rand(shape, generator=source) >= 0.5 for shape in shapes]
+    for i in range(2):
+        exact = literal_lpips(first[i], second[i], *published, [k[i : i + 1] for k in kept])
+        assert found[i].item() == pytest.approx(exact, rel=1e-4)
+        assert exact != pytest.approx(literal_lpips(first[i], second[i], *published), rel=1e-3)
 
 
 def small():

@@ -14,6 +14,7 @@ from twofold.deform.skinning import vertex_transforms
 from twofold.geometry.cameras import Camera, clip_to_box, pixel_grid, pixel_rays, project
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.methods.base import Avatar, PosedAvatar, Rendering
+from twofold.methods.placing import joint_box
 from twofold.outputs.views import body_up, draw, look_at, orbit, pose_canonically, rays_at_once
 from twofold.sampling.shell import build_shell
 
@@ -24,7 +25,7 @@ SHELL = build_shell(SHAPED.vertices, SHAPED.faces, 0.06, 0.1)
 
 def as_avatar(body):
     """Pictures of `Painted` ask for the body alone."""
-    return PosedAvatar(body, vertex_transforms(body), body.pose[1:].flatten(), SHELL)
+    return PosedAvatar(body, vertex_transforms(body), body.pose[1:].flatten(), SHELL, joint_box(body.joints))
 
 
 class Painted(Avatar):

@@ -80,9 +80,10 @@ def test_nothing_ignored_draws_as_if_there_were_no_layer(hidden):
 
 
 @pytest.fixture(scope="module")
-def noisy(flawless, tmp_path_factory):
+def noisy(tmp_path_factory):
     """A capture whose first picture has another colour in every pixel, and a soft disk as its mask."""
-    capture, folder = read_capture(flawless), tmp_path_factory.mktemp("noisy")
+    folder = tmp_path_factory.mktemp("noisy")
+    capture = read_capture(write_tiny(folder / "tiny"))
     image = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     disk = np.clip((9 - np.hypot(rows - 18, columns - 26)) / 3, 0, 1)
@@ -248,3 +249,102 @@ def test_batches_go_to_the_device(noisy, device):
     batch, there = source_of(noisy).draw(0, seeded()), source_of(noisy).draw(0, seeded(), device)
     assert {t.device.type for t in (there.color, there.mask, there.patch_pixels, there.rays.near)} == {device.type}
     assert torch.equal(there.color.cpu(), batch.color)
+
+
+RELEASED = {"reachable": "box", "subject": "any", "replacement": False, "rounded": False}
+
+
+def literal_box_hits(frame, joints, margin):
+    """Pixels of whose ray exactly two of the six plane hits lie on the box, one ray at a time."""
+    low, high = joints.amin(0).double() - margin, joints.amax(0).double() + margin
+    camera, found = frame.camera, torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    for row in range(HEIGHT):
+        for column in range(WIDTH):
+            pixel = torch.tensor([column, row, 1.0], dtype=torch.float64)
+            direction = camera.world_to_camera[:3, :3].T.double() @ (camera.intrinsics.double().inverse() @ pixel)
+            direction = direction / direction.norm()
+            direction = torch.tensor([1e-5 if abs(d) < 1e-5 else d for d in direction.tolist()], dtype=torch.float64)
+            hits = 0
+            for axis in range(3):
+                for plane in (low[axis], high[axis]):
+                    point = camera.center.double() + (plane - camera.center[axis]) / direction[axis] * direction
+                    hits += bool((point >= low - 1e-6).all() and (point <= high + 1e-6).all())
+            found[row, column] = hits == 2
+    return found
+
+
+@pytest.fixture(scope="module")
+def far(noisy):
+    """The noisy picture from further away, so that the box of the joints does not fill it."""
+    frame = noisy.train[0]
+    moved = frame.camera.world_to_camera.clone()
+    moved[2, 3] += 1.5
+    camera = replace(frame.camera, world_to_camera=moved)
+    return replace(noisy, splits={"train": (replace(frame, camera=camera),)})
+
+
+def test_released_pools_are_the_box_of_the_joints_and_the_mask_without_its_last_row_and_column(far):
+    frame, config = far.train[0], PixelConfig(**RELEASED)
+    source = PixelSource(far.train, far.body, far.betas, config, far.background, box_margin=0.3142)
+    joints = pose_body(shape_body(far.body, far.betas), frame.pose, frame.translation).joints
+    hit = literal_box_hits(frame, joints, 0.3142)
+    assert 0.1 < hit.float().mean() < 0.9
+    picture = source.picture(0)
+    assert picture.reachable.tolist() == hit.flatten().nonzero()[:, 0].tolist()
+    any_ = frame.mask() > 0
+    rows, columns = [sorted(set(axis.tolist())) for axis in any_.nonzero(as_tuple=True)]
+    box = [r * WIDTH + c for r in range(rows[0], rows[-1]) for c in range(columns[0], columns[-1]) if hit[r, c]]
+    assert picture.subject.tolist() == box
+    assert torch.equal(picture.inside, any_)
+
+
+def test_released_pixels_are_drawn_once_and_not_rounded(far):
+    frame, config = far.train[0], PixelConfig(rays=300, patches=3, patch_size=12, subject_share=0.7, **RELEASED)
+    source = PixelSource(far.train, far.body, far.betas, config, (0.1, 0.5, 0.9))
+    batch = source.draw(0, seeded())
+    rows, columns = pixels_seen_by(frame.camera, batch)
+    flat = (rows * WIDTH + columns).tolist()
+    assert len(set(flat[:210])) == 210
+    assert len(set(flat[210:300])) == 90
+    share = frame.mask()[rows, columns, None]
+    expected = frame.image()[rows, columns] * share + torch.tensor([0.1, 0.5, 0.9]) * (1 - share)
+    torch.testing.assert_close(batch.color, expected, atol=1e-7, rtol=0)
+    assert (batch.color * 255 - (batch.color * 255).round()).abs().max() > 0.3
+
+
+def test_a_pool_smaller_than_the_draw_is_drawn_with_replacement(far):
+    config = PixelConfig(rays=3000, patches=0, subject_share=1.0, **RELEASED)
+    assert len(PixelSource(far.train, far.body, far.betas, config, far.background).draw(0, seeded()).mask) == 3000
+
+
+@pytest.mark.parametrize("options", [{}, RELEASED])
+def test_patches_show_the_picture_where_no_ray_goes_and_fill_what_is_rendered_there(far, options):
+    frame, background = far.train[0], torch.tensor([0.1, 0.5, 0.9])
+    config = PixelConfig(patches=30, patch_size=20, **options)
+    source = PixelSource(far.train, far.body, far.betas, config, tuple(background.tolist()), margin=0.1)
+    batch = source.draw(0, seeded())
+    rows, columns = pixels_seen_by(frame.camera, batch)
+    share = frame.mask()[..., None]
+    whole = frame.image() * share + background * (1 - share)
+    rendered = batch.patches(batch.color, background).permute(0, 2, 3, 1)
+    plain = batch.patches(batch.color).permute(0, 2, 3, 1)
+    off = batch.patch_pixels < 0
+    assert 0.02 < off.float().mean() < 0.98
+    for patch in range(30):
+        ray = batch.patch_pixels[patch]
+        i, j = (ray >= 0).nonzero()[0].tolist()
+        top, left = int(rows[ray[i, j]]) - i, int(columns[ray[i, j]]) - j
+        shown = whole[top : top + 20, left : left + 20]
+        torch.testing.assert_close(batch.patch_color[patch], shown, atol=0.51 / 255, rtol=0)
+    torch.testing.assert_close(rendered[~off], batch.patch_color[~off])
+    assert (rendered[off] == background).all()
+    assert (plain[off] == 0).all()
+
+
+def test_ignored_pixels_of_a_patch_are_background_in_the_picture_too(hidden):
+    config = PixelConfig(patches=20, patch_size=12, patch_on_subject=1.0)
+    source = PixelSource(hidden.train, hidden.body, hidden.betas, config, (0.1, 0.5, 0.9), margin=9.0)
+    batch = source.draw(1, seeded())
+    off = batch.patch_pixels < 0
+    assert off.any()
+    assert (batch.patch_color[off] == torch.tensor([0.1, 0.5, 0.9])).all()

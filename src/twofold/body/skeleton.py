@@ -246,10 +246,26 @@ def skin(
     return (blended[:, :, :3] @ points[:, :, None])[..., 0] + blended[:, :, 3]
 
 
-def pose_body(shaped: ShapedBody, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"]) -> PosedBody:
-    """The body in a pose, its canonical twin, and the bone transforms between the two."""
+def pose_body(
+    shaped: ShapedBody,
+    pose: Float[Tensor, "24 3"],
+    translation: Float[Tensor, "3"],
+    rest_joints: Float[Tensor, "24 3"] | None = None,
+) -> PosedBody:
+    """The body in a pose, its canonical twin, and the bone transforms between the two.
+
+    Args:
+        shaped: the person's body.
+        pose: axis-angle, root first, radians.
+        translation: SMPL's own, metres.
+        rest_joints: joints of the T-pose from which the bones leave canonical space, metres; None takes the body's. The
+            release has those of the shape as given, whatever the shape was corrected to.
+    """
     rest_pose = canonical_pose(pose.dtype, pose.device)
     to_canonical = joint_transforms(shaped.joints, rest_pose, torch.zeros_like(translation))
+    from_canonical = to_canonical
+    if rest_joints is not None:
+        from_canonical = joint_transforms(rest_joints, rest_pose, torch.zeros_like(translation))
     to_world = joint_transforms(shaped.joints, pose, translation)
     posed_joints = (to_world[:, :3, :3] @ shaped.joints[:, :, None])[..., 0] + to_world[:, :3, 3]
     return PosedBody(
@@ -257,7 +273,7 @@ def pose_body(shaped: ShapedBody, pose: Float[Tensor, "24 3"], translation: Floa
         canonical_vertices=skin(blend_shapes(shaped, rest_pose), shaped.weights, to_canonical),
         faces=shaped.faces,
         weights=shaped.weights,
-        bones=to_world @ rigid_inverse(to_canonical),
+        bones=to_world @ rigid_inverse(from_canonical),
         joints=posed_joints,
         pose=pose,
     )

@@ -1,5 +1,7 @@
 """From posed to canonical space and back, by the skinning of the nearest body vertices."""
 
+from typing import Literal
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -53,6 +55,24 @@ def smooth_neighbour_weights(squared_distances: Float[Tensor, "S K"]) -> Float[T
     return raw / raw.sum(-1, keepdim=True)
 
 
+def weights_by(
+    falloff: Literal["exponential", "scene", "smooth"], squared_distances: Float[Tensor, "S K"], scale: float = 1.0
+) -> Float[Tensor, "S K"]:
+    """`neighbour_weights` of distances in metres ("exponential") or in scene units, or `smooth_neighbour_weights`.
+
+    >>> weights_by("scene", torch.tensor([[0.0, 0.01]]), scale=10.0)  # 1 m is 10 units, so 10 cm are one
+    tensor([[0.7311, 0.2689]])
+
+    Args:
+        falloff: which.
+        squared_distances: metres squared.
+        scale: scene units to a metre.
+    """
+    if falloff == "smooth":
+        return smooth_neighbour_weights(squared_distances)
+    return neighbour_weights(squared_distances * scale**2 if falloff == "scene" else squared_distances)
+
+
 def to_canonical(
     x_posed: Float[Tensor, "S 3"],
     nearest: Int[Tensor, "S K"],
@@ -74,13 +94,31 @@ def to_canonical(
     Returns:
         canonical points, and J^-T of the skinning: a canonical gradient times it is the gradient in observation space.
     """
-    if nearest.shape[1] == 1:
-        rows = weighted_rows(invert_affine(forward).flatten(1), nearest, torch.ones_like(shares)).unflatten(-1, (3, 4))
-    else:
-        rows = invert_affine(weighted_rows(forward.flatten(1), nearest, shares).unflatten(-1, (3, 4)))
+    rows = _inverse_rows(nearest, shares, forward)
     # A product of the whole batch with elementwise sums: batched 3x3 matrix products are slow on CPUs.
     x_canonical = (rows[..., :3] * x_posed[:, None, :]).sum(-1) + rows[..., 3]
     return x_canonical, rows[..., :3].transpose(-1, -2)
+
+
+def normal_matrices(
+    nearest: Int[Tensor, "S K"], shares: Float[Tensor, "S K"], forward: Float[Tensor, "V 3 4"]
+) -> Float[Tensor, "S 3 3"]:
+    """J^-T of `to_posed`: a canonical gradient times it is the gradient in observation space.
+
+    Args:
+        nearest: the K nearest canonical vertices of canonical points. The release takes normals by these, though the
+            posed vertex that carried a point into canonical space often is another one.
+        shares: weight of each of these.
+        forward: `vertex_transforms` of the posed body.
+    """
+    return _inverse_rows(nearest, shares, forward)[..., :3].transpose(-1, -2)
+
+
+def _inverse_rows(nearest: Tensor, shares: Tensor, forward: Tensor) -> Tensor:
+    """Inverse of the mixed transforms, [S 3 4]; with one neighbour inverted at the vertices, which are fewer."""
+    if nearest.shape[1] == 1:
+        return weighted_rows(invert_affine(forward).flatten(1), nearest, torch.ones_like(shares)).unflatten(-1, (3, 4))
+    return invert_affine(weighted_rows(forward.flatten(1), nearest, shares).unflatten(-1, (3, 4)))
 
 
 def to_posed(

@@ -89,6 +89,17 @@ def project(camera: Camera, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor
     return homogeneous[..., :2] / homogeneous[..., 2:], in_camera[..., 2]
 
 
+def without_tiny_components(rays: Rays, least: float = 1e-5) -> Rays:
+    """Rays whose direction components closer to zero than `least` become +`least`, as in the release.
+
+    >>> ray = Rays(torch.zeros(1, 3), torch.tensor([[0.0, -1e-6, 1.0]]), torch.zeros(1), torch.ones(1))
+    >>> without_tiny_components(ray).directions
+    tensor([[1.0000e-05, 1.0000e-05, 1.0000e+00]])
+    """
+    directions = torch.where(rays.directions.abs() < least, torch.full_like(rays.directions, least), rays.directions)
+    return Rays(rays.origins, directions, rays.near, rays.far)
+
+
 def clip_to_box(rays: Rays, low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> tuple[Rays, Bool[Tensor, "*b"]]:
     """Rays with near and far where they enter and leave an axis-aligned box, and which of them meet it at all."""
     # A direction component of exactly zero would divide 0 by 0 on a face of the box.

@@ -100,6 +100,9 @@ class Batch:
         mask: share of the pixel that the person covers.
         singles: how many of the rays are single pixels.
         patch_pixels: for each pixel of each patch, its ray, or -1 outside the body's box and where pixels are ignored.
+        patch_color: what the picture shows there, pixels without a ray included; the background where pixels are
+            ignored and beyond the picture.
+        background: colour outside the mask, 0..1.
     """
 
     rays: Rays
@@ -107,11 +110,15 @@ class Batch:
     mask: Float[Tensor, "R"]
     singles: int
     patch_pixels: Int[Tensor, "patches P P"]
+    patch_color: Float[Tensor, "patches P P 3"]
+    background: Float[Tensor, "3"]
 
-    def patches(self, color: Float[Tensor, "R 3"]) -> Float[Tensor, "patches 3 P P"]:
-        """The patches as pictures, from colours along the rays; pixels without a ray are black."""
-        padded = torch.cat([color, torch.zeros_like(color[:1])])
-        return padded[self.patch_pixels].permute(0, 3, 1, 2)
+    def patches(
+        self, color: Float[Tensor, "R 3"], fill: Float[Tensor, "3"] | None = None
+    ) -> Float[Tensor, "patches 3 P P"]:
+        """The patches as pictures, from colours along the rays; pixels without one have the colour `fill` or black."""
+        none = torch.zeros_like(color[0]) if fill is None else fill
+        return torch.cat([color, none[None]])[self.patch_pixels].permute(0, 3, 1, 2)
 
 
 @dataclass(frozen=True)
@@ -123,12 +130,18 @@ class PosedAvatar:
         forward: canonical-to-posed transform at each vertex.
         condition: what the pose-dependent branch is told.
         shell: where to sample.
+        box: two corners around the joints, where rays without a shell begin and end, metres.
+        neighbours: how many nearest vertices give a point its skinning weights.
+        anchors: canonical vertices that turn normals, where these are not the ones that inverse skinning found.
     """
 
     body: PosedBody
     forward: Float[Tensor, "V 3 4"]
     condition: Float[Tensor, "P"]
     shell: Shell
+    box: Float[Tensor, "2 3"]
+    neighbours: int = 1
+    anchors: Float[Tensor, "V 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -230,6 +243,9 @@ class Avatar(nn.Module, ABC):
     @abstractmethod
     def before_step(self, step: int) -> None:
         """Called before each training step."""
+
+    def count_epochs(self, steps: int | float) -> None:
+        """Called before the first step with the length of an epoch, for methods whose schedules count them."""
 
     def compiled(self) -> AbstractContextManager[bool]:
         """While the block lasts, what a compiler can make faster runs compiled; tells whether there is anything."""

@@ -11,61 +11,40 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from twofold import losses
 from twofold.body.skeleton import PosedBody, ShapedBody, pose_body, shape_body
 from twofold.config import require_within
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.deform.skinning import (
-    neighbour_weights,
-    smooth_neighbour_weights,
+    normal_matrices,
     to_canonical,
     vertex_transforms,
+    weights_by,
 )
 from twofold.field.factorized import FactorizedField, FactorizedFieldConfig
 from twofold.field.factorized_grid import GridField, GridFieldConfig
 from twofold.field.output import FieldOutput
-from twofold.geometry.cameras import Rays
+from twofold.geometry.cameras import Rays, without_tiny_components
 from twofold.geometry.surfaces import nearest_vertices
 from twofold.kernels.runtime import compiled_methods
 from twofold.losses import MOST_STEPS, LossConfig
 from twofold.methods.base import Avatar, Batch, MethodConfig, PosedAvatar, Rendering, Subject
+from twofold.methods.loss_terms import loss_terms
 from twofold.methods.placing import (
     Distance,
     Placed,
     ShellSampler,
+    joint_box,
     place_error_bounded,
     place_in_shell,
     that_count,
 )
+from twofold.methods.pose_schedule import PoseConfig, condition
 from twofold.metrics.perceptual import LPIPS
 from twofold.sampling.error_bounded import ErrorBoundedSampler
 from twofold.sampling.sdf_grid import DistanceTable, tabulate
 from twofold.sampling.shell import Shell, build_shell
 from twofold.volume.rendering import composite, composite_weights, laplace_density
 from twofold.volume.samples import Samples
-
-
-@dataclass(frozen=True)
-class PoseConfig:
-    """What the pose-dependent branch is told, and which poses are corrected while training."""
-
-    divide_by_pi: bool = True
-    with_root: bool = False
-    """Whether the global orientation is part of it."""
-    zero_until: int = 10_000
-    """The branch sees a zero pose before this step."""
-    zero_every: int = 50
-    """Afterwards it sees a zero pose during every epoch (a step a moment) whose number this divides; 0 for never."""
-    drop: float = 0.0
-    """Chance of a zero pose at any training step (ours; the schedule above is the release's)."""
-    refine: tuple[Literal["root", "body", "translation", "shape"], ...] = ("root", "body", "translation", "shape")
-    refine_from: int = 0
-    """First step at which poses are corrected."""
-
-    def __post_init__(self) -> None:
-        """Refuses chances and steps that there are not."""
-        steps = (0, MOST_STEPS)
-        require_within(self, zero_until=steps, zero_every=steps, drop=(0, 1), refine_from=steps)
 
 
 @dataclass(frozen=True)
@@ -78,9 +57,15 @@ class FactorizedConfig(MethodConfig):
     pose: PoseConfig = dataclasses.field(default_factory=PoseConfig)
     neighbours: int = 1
     """How many nearest vertices give a point its skinning weights."""
-    falloff: Literal["exponential", "smooth"] = "exponential"
-    """How these count by distance: "exponential" as in Vid2Avatar, nearly alike in metres; "smooth" falls to nothing at
-    the last of them, so that points beside each other are carried home alike."""
+    late_neighbours: int | None = None
+    """The same in training from epoch `late_from` on; 7 in the release, whose validation changes it."""
+    late_from: int = 100
+    """Epochs before that; every so many epochs the canonical body that turns normals follows the corrected shape."""
+    falloff: Literal["exponential", "scene", "smooth"] = "exponential"
+    """How these count by distance: "exponential", nearly alike in metres; "scene", so in scene units, as released;
+    "smooth", down to nothing at the last of them, so that points beside each other move alike."""
+    normals_by: Literal["posed", "canonical"] = "posed"
+    """Whose nearest vertices turn normals: "posed", those that moved the sample; "canonical", as released."""
     beta: float = 0.1
     """Initial scale of the density, metres."""
     beta_floor: float = 1e-4
@@ -99,7 +84,13 @@ class FactorizedConfig(MethodConfig):
     def __post_init__(self) -> None:
         """Refuses options that exclude each other."""
         require_within(
-            self, neighbours=(1, 64), shell_refresh=(1, MOST_STEPS), outlier_distance=(0.001, 10), beta=(0, 10)
+            self,
+            neighbours=(1, 64),
+            late_neighbours=(1, 64),
+            late_from=(1, MOST_STEPS),
+            shell_refresh=(1, MOST_STEPS),
+            outlier_distance=(0.001, 10),
+            beta=(0, 10),
         )
         _require(0 < self.beta_floor < self.beta, f"beta_floor should lie between 0 and beta={self.beta}")
         if isinstance(self.field, GridFieldConfig) and isinstance(self.sampler, ShellSampler):
@@ -118,6 +109,7 @@ class FactorizedAvatar(Avatar):
     shell_translations: Tensor
     shell_shape: Tensor
     canonical_points: Tensor
+    late_shape: Tensor
 
     def __init__(self, config: FactorizedConfig, subject: Subject, seed: int) -> None:
         """Builds the field around the subject's canonical body."""
@@ -141,6 +133,10 @@ class FactorizedAvatar(Avatar):
         self.register_buffer("shell_translations", subject.translations.clone())
         self.register_buffer("shell_shape", torch.zeros_like(subject.betas))
         self.register_buffer("canonical_points", canonical.canonical_vertices.clone(), persistent=False)
+        if config.late_neighbours is not None:
+            self.register_buffer("late_shape", torch.zeros_like(subject.betas))
+        self.epoch_steps: int | float = len(subject.times)
+        self.box_given = isinstance(config.sampler, ErrorBoundedSampler) and config.sampler.box == "given"
         self._shells: dict[int, Shell] = {}
         self._bodies = {torch.device("cpu"): subject.body}
         self._perceptual: tuple[LPIPS, ...] = ()
@@ -173,8 +169,16 @@ class FactorizedAvatar(Avatar):
         pose = [p for p in self.refinement.parameters() if p.requires_grad]
         return {**self.field.parameter_groups(), "beta": [self.raw_beta], "pose": pose}
 
+    def count_epochs(self, steps: int | float) -> None:
+        """See `Avatar.count_epochs`."""
+        if self.config.pose.epochs == "training":
+            self.epoch_steps = steps
+
     def before_step(self, step: int) -> None:
-        """Lets the shells follow the corrected poses from time to time."""
+        """Lets the shells, and the canonical body that turns normals, follow the corrections from time to time."""
+        passed = [self._epoch(at) // self.config.late_from for at in (max(step - 1, 0), step)]
+        if self.config.late_neighbours is not None and passed[1] > passed[0]:
+            self.late_shape.copy_(self.refinement.shape.detach())
         refresh = self.config.shell_refresh
         if not self.refinement.parts or step == 0 or step % refresh or step < self.config.pose.refine_from:
             return
@@ -192,38 +196,62 @@ class FactorizedAvatar(Avatar):
     ) -> PosedAvatar:  # fmt: skip
         """See `Avatar.pose`. While training, a moment's shell is reused until the next refresh."""
         pose, translation = pose.to(self.device), translation.to(self.device)
-        training = step is not None
-        refining = training and step >= self.config.pose.refine_from
+        config, training = self.config, step is not None
+        given, data = self._shape(None), (pose, translation)
+        refining = training and step >= config.pose.refine_from
         if time is not None:
             with torch.set_grad_enabled(torch.is_grad_enabled() and refining):
                 pose, translation = self.refinement(time, pose, translation)
         with torch.set_grad_enabled(torch.is_grad_enabled() and refining and bool(self.refinement.parts)):
-            body = pose_body(self._shape(self.refinement.shape), pose, translation)
+            refined = training or time is not None or config.pose.test_shape == "refined"
+            shaped = self._shape(self.refinement.shape) if refined else given
+            rest_joints = given.joints if config.pose.canonical_shape == "given" else None
+            body = pose_body(shaped, pose, translation, rest_joints)
             forward = vertex_transforms(body)
-        return PosedAvatar(body, forward, self._condition(pose, step), self._shell(body, time, training))
+        box = joint_box(body.joints)
+        if self.box_given:
+            box = joint_box(pose_body(given, *data).joints, self.subject.scene_scale)
+        neighbours = config.neighbours
+        if step is not None and config.late_neighbours is not None and self._epoch(step) >= config.late_from:
+            neighbours = config.late_neighbours
+        seen = condition(config.pose, pose, step, self._epoch(step or 0))
+        shell, anchors = self._shell(body, time, training), self._anchors(training)
+        return PosedAvatar(body, forward, seen, shell, box, neighbours, anchors)
 
-    def _shape(self, change: Tensor) -> ShapedBody:
+    def _shape(self, change: Tensor | None) -> ShapedBody:
+        """The body, its shape corrected by so much or as it was given."""
         body = self.subject.body
         if self.device not in self._bodies:
             tensors = {n: t.to(self.device) for n, t in vars(body).items() if isinstance(t, Tensor)}
             self._bodies[self.device] = type(body)(name=body.name, **tensors)
-        return shape_body(self._bodies[self.device], self.subject.betas.to(self.device) + change)
+        betas = self.subject.betas.to(self.device)
+        return shape_body(self._bodies[self.device], betas if change is None else betas + change)
 
-    def _condition(self, pose: Tensor, step: int | None) -> Tensor:
-        config = self.config.pose
-        told = (pose if config.with_root else pose[1:]).flatten()
-        if config.divide_by_pi:
-            told = told / math.pi
-        if step is not None:
-            epoch, dropped = step // len(self.subject.times), _hash01(step) < config.drop
-            if step < config.zero_until or dropped or (config.zero_every and epoch % config.zero_every == 0):
-                told = torch.zeros_like(told)
-        return told
+    def _epoch(self, step: int) -> int:
+        return int(step // self.epoch_steps)
+
+    def _anchors(self, training: bool) -> Tensor | None:
+        """Canonical vertices that turn normals, or None where those do that carried the sample home."""
+        if self.config.normals_by == "posed":
+            return None
+        if not training or self.config.late_neighbours is None or not self.late_shape.any():
+            return self.canonical_points
+        rest = torch.zeros(24, 3, device=self.device)
+        return pose_body(self._shape(self.late_shape), rest, rest[0]).canonical_vertices
+
+    def _carried(self, x_posed: Tensor, nearest: Tensor, shares: Tensor, posed: PosedAvatar) -> tuple[Tensor, Tensor]:
+        """Points in canonical space, and what turns their gradients into observation space."""
+        x_canonical, turn = to_canonical(x_posed, nearest, shares, posed.forward)
+        if posed.anchors is not None:
+            away, nearest = nearest_vertices(x_canonical, posed.anchors, posed.neighbours)
+            # Canonical space is in metres, in the release too.
+            turn = normal_matrices(nearest, weights_by(self.config.falloff, away.square()), posed.forward)
+        return x_canonical, turn
 
     def _shell(self, body: PosedBody, time: int | None, training: bool) -> Shell:
         sampler = self.config.sampler
         radius, voxel = (sampler.radius, sampler.voxel) if isinstance(sampler, ShellSampler) else (0.1, 0.03)
-        listed = max(6, 2 * self.config.neighbours)
+        listed = max(6, 2 * max(self.config.neighbours, self.config.late_neighbours or 1))
         row = self.refinement.rows.get(time) if training and time is not None else None
         if row is None:
             return build_shell(body.vertices, body.faces, radius, voxel, listed)
@@ -238,18 +266,19 @@ class FactorizedAvatar(Avatar):
         self, rays: Rays, posed: PosedAvatar, background: Float[Tensor, "3"], generator: torch.Generator | None = None
     ) -> Rendering:
         """See `Avatar.render`."""
+        rays = without_tiny_components(rays) if self.box_given else rays
         placed = self._place(rays, posed, generator)
         samples, outlier = placed.samples, placed.outlier
         if len(samples) == 0:
             return self._nothing(len(rays), background)
-        x_canonical, to_observation = to_canonical(samples.points(rays), placed.nearest, placed.shares, posed.forward)
+        x_canonical, to_observation = self._carried(samples.points(rays), placed.nearest, placed.shares, posed)
         answer = self.field(x_canonical, posed.condition, to_observation)
-        normals = F.normalize((to_observation * answer.gradient[:, None]).sum(-1), dim=-1)
+        normals = F.normalize((to_observation * answer.gradient[:, None]).sum(-1), dim=-1, eps=1e-6)
         whole = self._composite(answer, normals, samples, outlier, background, len(rays))
         if answer.base is None:
             return whole
         # The base picture's normals are its own branch's, at the same samples.
-        base_normals = F.normalize((to_observation * answer.base.gradient[:, None]).sum(-1), dim=-1)
+        base_normals = F.normalize((to_observation * answer.base.gradient[:, None]).sum(-1), dim=-1, eps=1e-6)
         base = self._composite(answer.base, base_normals, samples, outlier, background, len(rays))
         return Rendering(whole.color, whole.opacity, whole.depth, whole.normal, base)
 
@@ -274,7 +303,7 @@ class FactorizedAvatar(Avatar):
         return replace(empty, base=empty if two else None)
 
     def _place(self, rays: Rays, posed: PosedAvatar, generator: torch.Generator | None) -> Placed:
-        sampler, k = self.config.sampler, self.config.neighbours
+        sampler, k = self.config.sampler, posed.neighbours
         limit = self.config.outlier_distance / self.scale
 
         def distance(x_canonical: Tensor) -> Tensor:
@@ -282,7 +311,8 @@ class FactorizedAvatar(Avatar):
 
         weigh = self._weigh
         if isinstance(sampler, ErrorBoundedSampler):
-            placed = place_error_bounded(sampler, rays, posed, k, weigh, limit, generator, distance, self.beta)
+            scale = self.scale if sampler.units == "scene" else 1.0
+            placed = place_error_bounded(sampler, rays, posed, weigh, limit, generator, distance, self.beta, scale)
             shading = self.config.outliers_in_shading and generator is None
             return replace(placed, outlier=placed.outlier & shading)
         placed = place_in_shell(sampler, rays, posed, k, weigh, min(sampler.radius, limit), generator)
@@ -291,8 +321,7 @@ class FactorizedAvatar(Avatar):
         return that_count(sampler, placed, rays, posed, home, distance, self.beta, table)
 
     def _weigh(self, squared_distances: Float[Tensor, "S K"]) -> Float[Tensor, "S K"]:
-        exponential = self.config.falloff == "exponential"
-        return (neighbour_weights if exponential else smooth_neighbour_weights)(squared_distances)
+        return weights_by(self.config.falloff, squared_distances, self.scale)
 
     def _canonical_shell(self, sampler: ShellSampler, posed: PosedAvatar) -> Shell:
         if self._home is None or self._home.vertices.device != self.device:
@@ -306,8 +335,9 @@ class FactorizedAvatar(Avatar):
         if not isinstance(sampler, ShellSampler) or sampler.table_voxel == 0 or isinstance(self.field, GridField):
             return None
         state = tuple(parameter._version for parameter in self.field.parameters())
-        if self._last_table is not None and self._last_table[0] is posed and self._last_table[1] == state:
-            return self._last_table[2]
+        last = self._last_table
+        if last is not None and last[0] is posed and last[1] == state:
+            return last[2]
         if samples < _TABLE_PAYS * (0.015 / sampler.table_voxel) ** 3:
             return None
         table = tabulate(distance, self.canonical_points, sampler.table_voxel, sampler.radius)
@@ -318,31 +348,13 @@ class FactorizedAvatar(Avatar):
         self, rendering: Rendering, batch: Batch, posed: PosedAvatar, step: int, generator: torch.Generator
     ) -> dict[str, Float[Tensor, ""]]:
         """See `Avatar.losses`."""
-        config = self.config.losses
-        terms: dict[str, Tensor] = {}
-        terms["reconstruction"] = losses.reconstruction(rendering.color, batch.color, config.reduction)
-        if config.common and rendering.base is not None:
-            terms["common"] = losses.common(rendering.base.color, batch.color, config.reduction)
-        if config.eikonal:
-            terms["eikonal"] = losses.eikonal(self._eikonal_gradients(posed, generator))
-        if config.mask:
-            terms["mask"] = losses.mask(rendering.opacity, batch.mask, config.mask_form)
-        if config.s3im and batch.singles:
-            singles = slice(0, batch.singles)
-            terms["s3im"] = losses.s3im(rendering.color[singles], batch.color[singles], generator)
-        if config.lpips and self._perceptual and step >= config.lpips_start and len(batch.patch_pixels):
-            terms["lpips"] = self._perceptual[0](
-                *(batch.patches(color) for color in (rendering.color, batch.color))
-            ).mean()
-        return {name: getattr(config, name) * term for name, term in terms.items()}
 
-    def _eikonal_gradients(self, posed: PosedAvatar, generator: torch.Generator) -> Tensor:
-        config, points = self.config.losses, self.canonical_points
-        count, device = config.eikonal_points, generator.device
-        which = torch.randint(len(points), (count,), generator=generator, device=device)
-        moved = torch.randn(count, 3, generator=generator, device=device)
-        x = points[which.to(self.device)] + config.eikonal_spread * moved.to(self.device)
-        return self.field.distance_and_gradient(x, posed.condition)[1]
+        def gradients(x_canonical: Tensor) -> Tensor:
+            return self.field.distance_and_gradient(x_canonical, posed.condition)[1]
+
+        network = self._perceptual[0] if self._perceptual else None
+        vertices = self.canonical_points
+        return loss_terms(self.config.losses, rendering, batch, vertices, gradients, network, step, generator)
 
     def level(self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full") -> Float[Tensor, "S"]:
         """See `Avatar.level`."""
@@ -371,8 +383,8 @@ class FactorizedAvatar(Avatar):
         self, x_posed: Float[Tensor, "S 3"], posed: PosedAvatar
     ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 3"]]:
         """See `Avatar.to_canonical`; the nearest vertices are exact, `render` takes them from the shell's lists."""
-        distances, nearest = nearest_vertices(x_posed, posed.body.vertices, self.config.neighbours)
-        return to_canonical(x_posed, nearest, self._weigh(distances.square()), posed.forward)
+        distances, nearest = nearest_vertices(x_posed, posed.body.vertices, posed.neighbours)
+        return self._carried(x_posed, nearest, self._weigh(distances.square()), posed)
 
 
 def _require(holds: bool, wanted: str) -> None:
@@ -384,8 +396,3 @@ _TABLE_PAYS = 150_000
 """Samples from which on a distance table at 15 mm, of some eighty thousand nodes, is the quicker way."""
 _BETA_UNIT = 0.01
 """Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""
-
-
-def _hash01(step: int) -> float:
-    """A fixed number in 0..1 for each step, so that a resumed run makes the same choices."""
-    return ((step * 2654435761 + 12345) % 4294967296) / 4294967296

@@ -14,38 +14,57 @@ from twofold.sampling.error_bounded import ErrorBoundedSampler
 
 
 def released() -> Recipe:
-    """The authors' program: every number of their release. Days on a CPU, hours on a GPU."""
+    """The authors' program: every number of their release, and its habits. Days on a CPU, hours on a GPU."""
     return Recipe(
         name="released",
         method=FactorizedConfig(
             field=FactorizedFieldConfig(),
-            sampler=ErrorBoundedSampler(),
-            losses=LossConfig(),
-            pose=PoseConfig(),
+            sampler=ErrorBoundedSampler(ends="released", units="scene", box="given"),
+            losses=LossConfig(
+                lpips_start=20_001,
+                lpips_dropout=0.5,
+                lpips_off_box="picture",
+                mask_form="hard",
+                s3im_center=2.0,
+                eikonal_replacement=False,
+            ),
+            pose=PoseConfig(epochs="training", canonical_shape="given", test_shape="given"),
+            late_neighbours=7,
+            falloff="scene",
+            normals_by="canonical",
+            beta=0.1001,
             beta_form="absolute",
             outliers_in_shading=False,
             scene_scale="released",
         ),
-        training=TrainingConfig(),
+        training=TrainingConfig(
+            pixels=PixelConfig(reachable="box", subject="any", replacement=False, rounded=False), epochs="steps"
+        ),
     )
 
 
 def paper() -> Recipe:
-    """The text of the paper, to the letter where it says something; the release's numbers where it is silent."""
+    """The text of the paper, to the letter where it says something; the release's choices where it is silent."""
     start = released()
     field = FactorizedFieldConfig(
-        include_pi=True, gate_width=None, base_color="linear", sdf_head="linear", color_sees_position=False,
-        normals="canonical", pose_code=None, feature_code=None,
-    )  # fmt: skip
-    method = replace(
-        start.method,
-        field=field,
-        losses=replace(start.method.losses, mask=0.0, s3im=0.0, lpips_start=0, reduction="sum"),
-        pose=replace(start.method.pose, divide_by_pi=False, with_root=True, zero_until=0, zero_every=0),
-        beta_form="softplus",
-        outliers_in_shading=True,
-        scene_scale="metres",
+        include_pi=True,
+        gate_width=None,
+        base_color="linear",
+        color_sees_position=False,
+        normals="canonical",
+        pose_code=None,
+        feature_code=None,
     )
+    # The text sums colour differences over rays and channels. The release's weights belong to means, so the terms that
+    # are no sums are weighted by as many as a step's rays have channels.
+    pixels = start.training.pixels
+    summed = 3 * (pixels.rays + pixels.patches * pixels.patch_size**2)
+    weights = start.method.losses
+    losses = replace(
+        weights, mask=0.0, s3im=0.0, reduction="sum", eikonal=summed * weights.eikonal, lpips=summed * weights.lpips
+    )
+    pose = replace(start.method.pose, divide_by_pi=False, with_root=True, zero_until=0, zero_every=0)
+    method = replace(start.method, field=field, losses=losses, pose=pose)
     rate = 5e-4
     training = replace(
         start.training, rate_low=rate, rate_high=rate, rate_beta=rate, rate_pose=rate, adam_betas=(0.9, 0.99)
@@ -54,17 +73,38 @@ def paper() -> Recipe:
 
 
 def fast() -> Recipe:
-    """The released networks and losses with what makes them fast and changes no equation: shell sampling, bfloat16."""
+    """The released networks and losses with what makes them fast and changes no equation: shell sampling, bfloat16.
+
+    What the release does otherwise than it could is left out, each by its option: masks count by their parts; normals
+    turn by the inverse of what moved the sample; a corrected shape moves canonical space along, in tests too; nothing
+    but learning rates and the pose changes at an epoch; all is in metres.
+    """
     start = released()
+    losses = replace(
+        start.method.losses,
+        lpips_start=20_000,
+        lpips_dropout=0.0,
+        lpips_off_box="black",
+        mask_form="sides",
+        s3im_center=1.5,
+        eikonal_replacement=True,
+    )
     method = replace(
         start.method,
         field=replace(start.method.field, hidden_dtype="auto"),
         sampler=ShellSampler(),
+        losses=losses,
+        pose=replace(start.method.pose, epochs="moments", canonical_shape="refined", test_shape="refined"),
+        late_neighbours=None,
+        falloff="exponential",
+        normals_by="posed",
+        beta=0.1,
         beta_form="softplus",
         outliers_in_shading=True,
         scene_scale="metres",
     )
-    return replace(start, name="fast", method=method)
+    pixels = replace(start.training.pixels, reachable="body", subject="half", replacement=True, rounded=True)
+    return replace(start, name="fast", method=method, training=replace(start.training, pixels=pixels, epochs="images"))
 
 
 def quick() -> Recipe:
@@ -75,25 +115,49 @@ def quick() -> Recipe:
             field=GridFieldConfig(),
             sampler=ShellSampler(radius=0.06, step=0.01, least_weight=2e-3, stray=0.006),
             losses=LossConfig(
-                eikonal=0.05, mask=0.3, mask_form="mean", s3im=0.0, lpips=0.0, common=0.5, eikonal_points=512
+                eikonal=0.05,
+                mask=0.3,
+                mask_form="mean",
+                s3im=0.0,
+                lpips=0.0,
+                common=0.5,
+                eikonal_points=512,
+                eikonal_replacement=True,
             ),
-            pose=PoseConfig(zero_until=200, zero_every=0, drop=0.2, refine_from=200),
+            pose=PoseConfig(
+                zero_until=200, zero_every=0, drop=0.2, refine_from=200, canonical_shape="refined", test_shape="refined"
+            ),
             neighbours=6,
+            late_neighbours=None,
             falloff="smooth",
+            normals_by="posed",
             beta=0.01,
             beta_floor=1.5e-3,
+            beta_form="softplus",
+            outliers_in_shading=True,
+            scene_scale="metres",
             shell_refresh=400,
         ),
         training=TrainingConfig(
             steps=4000,
             images_per_step=1,
-            pixels=PixelConfig(rays=1024, subject_share=0.95, surroundings=6, patches=0),
+            pixels=PixelConfig(
+                rays=1024,
+                subject_share=0.95,
+                surroundings=6,
+                patches=0,
+                reachable="body",
+                subject="half",
+                replacement=True,
+                rounded=True,
+            ),
             rate_low=2e-3,
             rate_high=2e-3,
             rate_grid=1e-2,
             rate_beta=3e-4,
             rate_pose=5e-4,
             milestones=(),
+            epochs="images",
             warmup=30,
             decay=0.1,
             adam_betas=(0.9, 0.99),

@@ -168,34 +168,52 @@ def seen_in_shell(
     return asked[seen_samples(placed.samples[asked], density, rays, least)]
 
 
+RELEASED_MARGIN = 0.3
+"""How far the box of the joints reaches beyond them in the release, metres."""
+RELEASED_SLACK = 0.01
+"""What it is enlarged by after that, scene units."""
+
+
+def joint_box(joints: Float[Tensor, "J 3"], scale: float = 1.0) -> Float[Tensor, "2 3"]:
+    """Lower and upper corner of the axis-aligned box around joints, without gradients.
+
+    Args:
+        joints: metres.
+        scale: scene units to a metre.
+    """
+    margin = RELEASED_MARGIN + RELEASED_SLACK / scale
+    return torch.stack([joints.detach().amin(0) - margin, joints.detach().amax(0) + margin])
+
+
 def place_error_bounded(
-    sampler: ErrorBoundedSampler, rays: Rays, posed: PosedAvatar, neighbours: int, shares: Shares, limit: float,
-    generator: torch.Generator | None, distance: Distance, beta: Float[Tensor, ""],
+    sampler: ErrorBoundedSampler, rays: Rays, posed: PosedAvatar, shares: Shares, limit: float,
+    generator: torch.Generator | None, distance: Distance, beta: Float[Tensor, ""], scale: float = 1.0,
 ) -> Placed:  # fmt: skip
     """Samples in the box of the joints by the error-bounded sampler.
 
     Args:
         sampler: its constants.
         rays: to place samples on.
-        posed: the body.
-        neighbours: how many nearest vertices carry a sample home.
+        posed: the body, the box, and how many nearest vertices carry a sample home.
         shares: weighs these.
         limit: samples further than this from the body are outliers, metres.
         generator: places them at random (training); None evenly.
         distance: of the field.
         beta: scale of the density, metres.
+        scale: of the sampler's units, which it sees origins and depths in, to a metre; distances stay in metres.
     """
-    margin = 0.31
-    low, high = posed.body.joints.detach().amin(0) - margin, posed.body.joints.detach().amax(0) + margin
-    clipped, hit = clip_to_box(rays, low, high)
+    clipped, hit = clip_to_box(rays, *posed.box)
     inside = hit.nonzero()[:, 0]
+    seen = clipped[inside]
+    seen = Rays(seen.origins * scale, seen.directions, seen.near * scale, seen.far * scale)
     tree = search_tree(posed.body.vertices.detach().cpu().numpy())
 
     def nearest_to(points: Tensor) -> tuple[Tensor, Tensor]:
-        away, index = query_nearest(tree, points.detach().cpu().numpy(), neighbours)
+        away, index = query_nearest(tree, points.detach().cpu().numpy(), posed.neighbours)
         return torch.from_numpy(index).to(points.device), torch.from_numpy(away).float().to(points.device)
 
     def sdf(points: Tensor) -> Tensor:
+        points = points / scale
         index, apart = nearest_to(points)
         x_canonical, _ = to_canonical(points, index, shares(apart**2), posed.forward.detach())
         value = distance(x_canonical)
@@ -203,7 +221,7 @@ def place_error_bounded(
         return value if generator is not None else torch.where(apart[:, 0] > limit, 4.0, value)
 
     with torch.no_grad():
-        samples = sampler.sample(clipped[inside], sdf, beta, generator, generator is not None)
-    samples = Samples(inside[samples.ray_index], samples.depth, samples.delta)
+        samples = sampler.sample(seen, sdf, beta, generator, generator is not None)
+    samples = Samples(inside[samples.ray_index], samples.depth / scale, samples.delta / scale)
     index, apart = nearest_to(samples.points(rays))
     return Placed(samples, index, shares(apart**2), apart[:, 0] > limit)

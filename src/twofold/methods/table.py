@@ -9,6 +9,7 @@ from twofold.errors import TwofoldError
 from twofold.methods import factorized_recipes
 from twofold.methods.base import MethodConfig
 from twofold.methods.factorized import FactorizedConfig
+from twofold.methods.stored import completed
 from twofold.recipe import Recipe, TrainingConfig
 
 
@@ -58,7 +59,7 @@ def recipe_from_dict(data: object, where: str) -> Recipe:
     """
     if not isinstance(data, dict):
         raise TwofoldError(f"{where} should hold an object with a recipe; it holds {type(data).__name__}.")
-    whole = cast(dict[str, Any], data)
+    whole = cast(dict[str, Any], completed(cast(dict[str, object], data)))
     method = whole.get("method")
     if not isinstance(method, dict):
         raise TwofoldError(f"{where} lacks the method's settings, an object called method; it is damaged.")

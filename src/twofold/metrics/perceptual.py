@@ -50,12 +50,17 @@ class LPIPS(nn.Module):
         self.scale = nn.Parameter(torch.tensor(_SCALE)[:, None, None])
         self.requires_grad_(False)
 
-    def forward(self, first: Float[Tensor, "n 3 h w"], second: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n"]:
+    def forward(
+        self, first: Float[Tensor, "n 3 h w"], second: Float[Tensor, "n 3 h w"], dropout: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> Float[Tensor, "n"]:  # fmt: skip
         """Distance of each pair of pictures, 0 for equal ones.
 
         Args:
             first: colours 0..1, at least 16 pixels high and wide.
             second: the same.
+            dropout: chance of each squared difference of features to be left out; the others are scaled up to match.
+            generator: draws which are left out.
         """
         if min(first.shape[-2:]) < 16:
             raise ValueError(f"LPIPS needs pictures of at least 16 x 16 pixels, these have {tuple(first.shape[-2:])}")
@@ -68,7 +73,11 @@ class LPIPS(nn.Module):
             for convolution in block:
                 x = F.relu(convolution(x))
             one, other = (x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + 1e-10)).chunk(2)
-            distance = distance + ((one - other).square() * weight[:, None, None]).sum(1).mean((1, 2))
+            squared = (one - other).square()
+            if dropout:
+                chance = torch.rand(squared.shape, generator=generator, device=generator.device if generator else None)
+                squared = squared * (chance.to(squared.device) >= dropout) / (1 - dropout)
+            distance = distance + (squared * weight[:, None, None]).sum(1).mean((1, 2))
         return distance
 
 

@@ -111,6 +111,10 @@ class ErrorBoundedSampler:
         rounds: at most.
         ends: two more depths: "released" has the constants 0 and 6 (whatever the ray's box, so haze behind the body
             counts while the density is soft), "ray" the ray's own near and far.
+        units: of the rays that it is given by a method: "metres", or "scene", as released, the units of a normalised
+            scene, in which lengths on rays meet signed distances in metres.
+        box: of the rays' near and far: "posed", 0.31 m around the joints of the corrected pose; "given", as released,
+            0.3 m and 0.01 scene units around those of the pose as given, with tiny components of directions replaced.
         per_ray_stop: a ray within the tolerance is refined no more; otherwise, as released, all go on until all are.
     """
 
@@ -121,6 +125,8 @@ class ErrorBoundedSampler:
     bisections: int = 10
     rounds: int = 5
     ends: Literal["released", "ray"] = "released"
+    units: Literal["metres", "scene"] = "metres"
+    box: Literal["posed", "given"] = "posed"
     per_ray_stop: bool = False
 
     def __post_init__(self) -> None:

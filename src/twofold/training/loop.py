@@ -21,6 +21,7 @@ from twofold.errors import TwofoldError
 from twofold.files import plain_errors
 from twofold.kernels.runtime import flush_denormals
 from twofold.methods.base import Avatar, Subject
+from twofold.methods.placing import RELEASED_MARGIN, RELEASED_SLACK
 from twofold.recipe import Recipe, TrainingConfig
 from twofold.training.curves import Curves
 from twofold.training.lock import locked
@@ -92,19 +93,31 @@ def mixed(*numbers: int) -> int:
     return int(np.random.SeedSequence(list(numbers)).generate_state(1, np.uint64)[0]) >> 1
 
 
+def epoch_steps(config: TrainingConfig, frames: int) -> int | float:
+    """Steps of an epoch: pictures over pictures per step, and as released the next whole number.
+
+    >>> epoch_steps(TrainingConfig(images_per_step=2), 5), epoch_steps(TrainingConfig(epochs="steps"), 5)
+    (2.5, 3)
+    """
+    steps = frames / config.images_per_step
+    return steps if config.epochs == "images" else math.ceil(steps)
+
+
 def frame_order(recipe: Recipe, frames: int, step: int) -> list[int]:
     """Which frames a step looks at: each epoch goes through all of them in an order of its own."""
-    images = recipe.training.images_per_step
+    config, images = recipe.training, recipe.training.images_per_step
+    # Positions in an endless row of epochs; whole steps make every epoch as long as all its steps.
+    length = frames if config.epochs == "images" else images * math.ceil(frames / images)
     chosen = []
     for position in range(step * images, (step + 1) * images):
-        generator = torch.Generator().manual_seed(mixed(recipe.seed, 7, position // frames))
-        chosen.append(int(torch.randperm(frames, generator=generator)[position % frames]))
+        generator = torch.Generator().manual_seed(mixed(recipe.seed, 7, position // length))
+        chosen.append(int(torch.randperm(frames, generator=generator)[position % length % frames]))
     return chosen
 
 
 def rate_factor(config: TrainingConfig, step: int, frames: int) -> float:
     """What the learning rates are multiplied with at a step: warm-up, milestones, decay."""
-    epoch = step * config.images_per_step / frames
+    epoch = step * config.images_per_step / frames if config.epochs == "images" else step // epoch_steps(config, frames)
     factor = 0.5 ** sum(epoch >= milestone for milestone in config.milestones)
     if config.warmup:
         factor *= min(1.0, (step + 1) / config.warmup)
@@ -182,10 +195,12 @@ def train(
             start_folder(folder, recipe, subject, capture.folder, tuple(notes))
             if not begun:
                 at_the_end.enter_context(locked(folder))
+        avatar.count_epochs(epoch_steps(config, len(capture.train)))
         optimizer = make_optimizer(avatar, config)
         start = _restore(folder, avatar, optimizer) if resume else 0
         margin = getattr(recipe.method.sampler, "radius", 0.3) + 0.02
-        source = PixelSource(capture.train, subject.body, subject.betas, config.pixels, capture.background, margin)
+        box = RELEASED_MARGIN + RELEASED_SLACK / subject.scene_scale
+        source = PixelSource(capture.train, subject.body, subject.betas, config.pixels, capture.background, margin, box)
         module: nn.Module = Step(avatar, source, torch.tensor(capture.background, device=device), recipe)
         if team.size > 1:
             module = team.shared(module)

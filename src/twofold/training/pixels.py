@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-from twofold.body.skeleton import Body, pose_body, shape_body
+from twofold.body.skeleton import Body, PosedBody, pose_body, shape_body
 from twofold.capture.types import Frame
 from twofold.errors import TwofoldError
-from twofold.geometry.cameras import Rays, pixel_rays, project
+from twofold.geometry.cameras import Rays, clip_to_box, pixel_grid, pixel_rays, project, without_tiny_components
 from twofold.methods.base import Batch
 from twofold.recipe import PixelConfig
 
@@ -23,6 +23,12 @@ class _Picture:
     subject: Tensor
     reachable: Tensor
     inside: Bool[Tensor, "h w"]
+    known: Bool[Tensor, "h w"]
+
+    def colors(self, index: Tensor) -> Tensor:
+        """Of pixels by their flat index, 0..1."""
+        found = self.image.flatten(0, 1)[index]
+        return found.float() / 255 if found.dtype == torch.uint8 else found
 
 
 class PixelSource:
@@ -30,7 +36,7 @@ class PixelSource:
 
     def __init__(
         self, frames: tuple[Frame, ...], body: Body, betas: Float[Tensor, "S"], config: PixelConfig,
-        background: tuple[float, float, float], margin: float = 0.31,
+        background: tuple[float, float, float], margin: float = 0.31, box_margin: float = 0.31,
     ) -> None:  # fmt: skip
         """Nothing is read yet.
 
@@ -40,9 +46,10 @@ class PixelSource:
             betas: that person's shape.
             config: how to draw.
             background: colour put outside the mask, 0..1.
-            margin: how far the body's box reaches beyond its joints, metres.
+            margin: how far from the body pixels are reachable, metres.
+            box_margin: how far the box of the joints reaches beyond them, metres.
         """
-        self.frames, self.config, self.margin = frames, config, margin
+        self.frames, self.config, self.margin, self.box_margin = frames, config, margin, box_margin
         self._shaped = shape_body(body, betas)
         self._background = torch.tensor(background)
         self._pictures: dict[int, _Picture] = {}
@@ -60,28 +67,21 @@ class PixelSource:
     def _read(self, frame: Frame) -> _Picture:
         mask = frame.mask()
         image = frame.image() * mask[..., None] + self._background * (1 - mask[..., None])
-        inside = mask > 0.5
+        inside = mask > (0.5 if self.config.subject == "half" else 0)
         if not inside.any():
+            limit = 127 if self.config.subject == "half" else 0
             raise TwofoldError(
-                f"{frame.mask_file} shows nobody: no pixel is brighter than 127 of 255; make the mask again or "
+                f"{frame.mask_file} shows nobody: no pixel is brighter than {limit} of 255; make the mask again or "
                 "leave the picture out of the training frames."
             )
-        height, width = mask.shape
-        # Pixels whose ray may meet the body: the projected vertices, grown by the margin.
         body = pose_body(self._shaped, frame.pose, frame.translation)
-        pixels, depth = project(frame.camera, body.vertices)
-        shown = pixels[depth > 0].round().long()
-        shown = shown[(shown >= 0).all(-1) & (shown[:, 0] < width) & (shown[:, 1] < height)]
-        touched = np.ones((height, width), dtype=bool)
-        touched[shown[:, 1].numpy(), shown[:, 0].numpy()] = False
-        touched &= ~inside.numpy()
-        away = np.asarray(ndimage.distance_transform_edt(touched))
-        focal = float(frame.camera.intrinsics[0, 0]) / max(float(depth.median()), 1e-3)
-        reachable = torch.from_numpy(away <= self.margin * focal)
+        near = self._near_body if self.config.reachable == "body" else self._in_box
+        reachable = near(frame, body, inside)
         if self.config.surroundings is None:
             rows, columns = inside.any(1).nonzero()[:, 0], inside.any(0).nonzero()[:, 0]
+            end = 1 if self.config.subject == "half" else 0
             subject = torch.zeros_like(inside)
-            subject[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
+            subject[rows.min() : rows.max() + end, columns.min() : columns.max() + end] = True
         else:
             off = np.asarray(ndimage.distance_transform_edt(~inside.numpy()))
             subject = torch.from_numpy(off <= self.config.surroundings)
@@ -95,45 +95,76 @@ class PixelSource:
             )
         subject &= reachable
         return _Picture(
-            (image * 255).round().to(torch.uint8),
+            (image * 255).round().to(torch.uint8) if self.config.rounded else image,
             (mask * 255).round().to(torch.uint8),
             subject.flatten().nonzero()[:, 0].int(),
             reachable.flatten().nonzero()[:, 0].int(),
             inside,
+            known,
         )
+
+    def _near_body(self, frame: Frame, body: PosedBody, inside: Tensor) -> Tensor:
+        """Pixels whose ray may meet the body: the projected vertices and the mask, grown by the margin."""
+        height, width = inside.shape
+        pixels, depth = project(frame.camera, body.vertices)
+        shown = pixels[depth > 0].round().long()
+        shown = shown[(shown >= 0).all(-1) & (shown[:, 0] < width) & (shown[:, 1] < height)]
+        touched = np.ones((height, width), dtype=bool)
+        touched[shown[:, 1].numpy(), shown[:, 0].numpy()] = False
+        touched &= ~inside.numpy()
+        away = np.asarray(ndimage.distance_transform_edt(touched))
+        focal = float(frame.camera.intrinsics[0, 0]) / max(float(depth.median()), 1e-3)
+        return torch.from_numpy(away <= self.margin * focal)
+
+    def _in_box(self, frame: Frame, body: PosedBody, inside: Tensor) -> Tensor:
+        """Pixels whose ray meets the box of the joints."""
+        rays = without_tiny_components(pixel_rays(frame.camera, pixel_grid(frame.camera)))
+        return clip_to_box(rays, body.joints.amin(0) - self.box_margin, body.joints.amax(0) + self.box_margin)[1]
 
     def draw(self, which: int, generator: torch.Generator, device: torch.device | str = "cpu") -> Batch:
         """A batch from frame number `which`; the generator decides everything."""
         picture, config = self.picture(which), self.config
-        width = picture.image.shape[1]
+        height, width = picture.image.shape[:2]
         near = round(config.rays * config.subject_share)
         chosen = [
-            pool[torch.randint(len(pool), (count,), generator=generator)].long()
+            pool[self._choose(len(pool), count, generator)].long()
             for pool, count in ((picture.subject, near), (picture.reachable, config.rays - near))
         ]
         patches = torch.full((config.patches, config.patch_size, config.patch_size), -1, dtype=torch.long)
+        background = self._background.to(torch.float32)
+        patch_color = background.expand(*patches.shape, 3).clone()
         used = config.rays
-        reachable = torch.zeros(picture.image.shape[0] * width, dtype=torch.bool)
+        reachable = torch.zeros(height * width, dtype=torch.bool)
         reachable[picture.reachable.long()] = True
         for patch in range(config.patches):
-            pixels, rays = self._patch(picture, reachable, generator)
-            order = torch.arange(used, used + len(pixels))
-            patches[patch].view(-1)[rays] = order
-            chosen.append(pixels)
-            used += len(pixels)
+            window, within = self._window(picture, reachable, generator)
+            shown = within & picture.known.flatten()[window]
+            patch_color[patch].view(-1, 3)[shown] = picture.colors(window[shown])
+            rays = (within & reachable[window]).nonzero()[:, 0]
+            patches[patch].view(-1)[rays] = torch.arange(used, used + len(rays))
+            chosen.append(window[rays])
+            used += len(rays)
         index = torch.cat(chosen)
         position = torch.stack([index % width, index // width], -1).float()
         rays = pixel_rays(self.frames[which].camera, position)
         return Batch(
             rays=Rays(*(t.to(device) for t in (rays.origins, rays.directions, rays.near, rays.far))),
-            color=(picture.image.flatten(0, 1)[index].float() / 255).to(device),
+            color=picture.colors(index).to(device),
             mask=(picture.mask.flatten()[index].float() / 255).to(device),
             singles=config.rays,
             patch_pixels=patches.to(device),
+            patch_color=patch_color.to(device),
+            background=background.to(device),
         )
 
-    def _patch(self, picture: _Picture, reachable: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Pixels of one patch and their places in it; those that cannot meet the body or are ignored are left out."""
+    def _choose(self, pool: int, count: int, generator: torch.Generator) -> Tensor:
+        """Places in a pool; one too small to give each at most once gives them with replacement after all."""
+        if self.config.replacement or pool < count:
+            return torch.randint(pool, (count,), generator=generator)
+        return torch.randperm(pool, generator=generator)[:count]
+
+    def _window(self, picture: _Picture, reachable: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Flat pixels of one patch row by row, and which of them lie in the picture."""
         size = self.config.patch_size
         height, width = picture.image.shape[:2]
         on_subject = bool(torch.rand((), generator=generator) < self.config.patch_on_subject)
@@ -144,5 +175,4 @@ class PixelSource:
         left = min(max(center % width - size // 2, 0), max(width - size, 0))
         rows, columns = torch.meshgrid(torch.arange(size) + top, torch.arange(size) + left, indexing="ij")
         flat = (rows.clamp_max(height - 1) * width + columns.clamp_max(width - 1)).flatten()
-        within = ((rows < height) & (columns < width)).flatten() & reachable[flat]
-        return flat[within], within.nonzero()[:, 0]
+        return flat, ((rows < height) & (columns < width)).flatten()

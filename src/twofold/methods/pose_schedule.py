@@ -1,0 +1,66 @@
+"""What of the pose the pose-dependent branch sees, and when; and what of the given poses is corrected."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from twofold.config import require_within
+from twofold.losses import MOST_STEPS
+
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """What the pose-dependent branch is told, and which poses are corrected while training."""
+
+    divide_by_pi: bool = True
+    with_root: bool = False
+    """Whether the global orientation is part of it."""
+    zero_until: int = 10_000
+    """The branch sees a zero pose before this step."""
+    zero_every: int = 50
+    """Afterwards it sees a zero pose during every epoch (a step a moment) whose number this divides; 0 for never."""
+    drop: float = 0.0
+    """Chance of a zero pose at any training step (ours; the schedule above is the release's)."""
+    epochs: Literal["moments", "training"] = "moments"
+    """Epochs of `zero_every`: "moments", one step for each moment; "training", those of the training, as released."""
+    refine: tuple[Literal["root", "body", "translation", "shape"], ...] = ("root", "body", "translation", "shape")
+    refine_from: int = 0
+    """First step at which poses are corrected."""
+    canonical_shape: Literal["refined", "given"] = "refined"
+    """Whose joints bones leave canonical space from: the corrected shape's, or, as released, those of the one given."""
+    test_shape: Literal["refined", "given"] = "refined"
+    """Shape of poses that are no training moments: the corrected one, or, as released, the one given."""
+
+    def __post_init__(self) -> None:
+        """Refuses chances and steps that there are not."""
+        steps = (0, MOST_STEPS)
+        require_within(self, zero_until=steps, zero_every=steps, drop=(0, 1), refine_from=steps)
+
+
+def condition(config: PoseConfig, pose: Float[Tensor, "24 3"], step: int | None, epoch: int) -> Float[Tensor, "P"]:
+    """What the pose-dependent branch is conditioned on.
+
+    Args:
+        config: its form and schedule.
+        pose: axis-angle, root first, radians.
+        step: the training step; None when not training, where the schedule does not hold.
+        epoch: that the step belongs to.
+    """
+    seen = (pose if config.with_root else pose[1:]).flatten()
+    if config.divide_by_pi:
+        seen = seen / math.pi
+    if step is None:
+        return seen
+    dropped = _hash01(step) < config.drop
+    if step < config.zero_until or dropped or (config.zero_every and epoch % config.zero_every == 0):
+        return torch.zeros_like(seen)
+    return seen
+
+
+def _hash01(step: int) -> float:
+    """A fixed number in 0..1 for each step, so that a resumed run makes the same choices."""
+    return ((step * 2654435761 + 12345) % 4294967296) / 4294967296

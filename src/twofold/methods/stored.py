@@ -1,0 +1,42 @@
+"""Recipes as earlier versions stored them: what a setting that they lack stands for."""
+
+from typing import cast
+
+ABSENT: dict[str, dict[str, object]] = {
+    "method": {"late_neighbours": None, "late_from": 100, "normals_by": "posed"},
+    "method.sampler": {"units": "metres", "box": "posed"},
+    "method.pose": {"epochs": "moments", "canonical_shape": "refined", "test_shape": "refined"},
+    "method.losses": {
+        "lpips_dropout": 0.0, "lpips_off_box": "black", "s3im_center": 1.5, "eikonal_replacement": True,
+    },
+    "training": {"epochs": "images"},
+    "training.pixels": {"reachable": "body", "subject": "half", "replacement": True, "rounded": True},
+}  # fmt: skip
+"""By the place in a recipe, what was done before a setting existed. A new recipe stores all of its settings, so a
+default may change and a run still means the same."""
+KINDS = {"method": "FactorizedConfig", "method.sampler": "ErrorBoundedSampler"}
+"""What must be stored at a place, or above it, for its settings to be missing; nothing stands for the first method."""
+
+
+def completed(recipe: dict[str, object]) -> dict[str, object]:
+    """A stored recipe with the settings that were not there when it was written.
+
+    >>> completed({"training": {"steps": 5}, "method": {"kind": "Another"}})
+    {'training': {'epochs': 'images', 'steps': 5}, 'method': {'kind': 'Another'}}
+    """
+    for place in ABSENT:
+        recipe = _with(recipe, place.split("."), "", ABSENT[place])
+    return recipe
+
+
+def _with(stored: dict[str, object], ahead: list[str], place: str, settings: dict[str, object]) -> dict[str, object]:
+    kind = KINDS.get(place)
+    if kind and stored.get("kind", kind) != kind:
+        return stored
+    if not ahead:
+        return settings | stored
+    within = stored.get(ahead[0])
+    if not isinstance(within, dict):
+        return stored
+    place = f"{place}.{ahead[0]}".lstrip(".")
+    return stored | {ahead[0]: _with(cast(dict[str, object], within), ahead[1:], place, settings)}

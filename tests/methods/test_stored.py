@@ -1,0 +1,64 @@
+"""Recipes of commit b5dcfbf still mean what they meant."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from twofold.methods.factorized_recipes import quick, released
+from twofold.methods.stored import ABSENT, KINDS, completed
+from twofold.methods.table import recipe_from_dict, recipe_to_dict
+
+STORED = Path(__file__).with_name("stored")
+
+
+def leaves(config, prefix=""):
+    found = {}
+    for key, value in config.items():
+        found |= leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return found
+
+
+@pytest.mark.parametrize("name", ["quick", "released"])
+def test_settings_that_a_stored_recipe_lacks_are_what_was_done_before(name):
+    stored = json.loads((STORED / f"{name}.json").read_text())
+    read, was = leaves(recipe_to_dict(recipe_from_dict(stored, "here"))), leaves(stored)
+    assert {key: read[key] for key in was} == was, "what was stored stays"
+    table = {f"{place}.{key}": value for place, settings in ABSENT.items() for key, value in settings.items()}
+    added = {key: read[key] for key in read.keys() - was.keys() - {"method.kind"}}
+    assert added == {key: table[key] for key in added}
+    sampler = {f"method.sampler.{key}" for key in ABSENT["method.sampler"]}
+    assert table.keys() - added.keys() == (sampler if name == "quick" else set())
+
+
+def test_quick_of_then_is_quick_of_now():
+    stored = json.loads((STORED / "quick.json").read_text())
+    assert recipe_from_dict(stored, "here") == quick()
+
+
+def test_a_recipe_of_now_is_complete():
+    assert completed(recipe_to_dict(released())) == recipe_to_dict(released())
+
+
+def test_every_setting_of_the_table_exists_and_the_old_value_is_allowed():
+    for place, settings in ABSENT.items():
+        config = released()
+        for name in place.split("."):
+            config = getattr(config, name)
+        assert KINDS.get(place, type(config).__name__) == type(config).__name__
+        assert settings.keys() <= {f.name for f in dataclasses.fields(config)}
+        dataclasses.replace(config, **settings)
+
+
+def test_settings_of_one_method_are_not_given_to_another():
+    other = {"method": {"kind": "Other", "pose": {}, "losses": {}, "sampler": {"kind": "ErrorBoundedSampler"}}}
+    assert completed(other) == other
+
+
+@pytest.mark.parametrize("odd", [{}, {"method": 3}, {"training": []}, {"method": {"sampler": None}}])
+def test_what_is_no_recipe_is_left_to_its_reader(odd):
+    found = completed(odd)
+    assert {key: found[key] for key in odd if not isinstance(odd[key], dict)} == {
+        key: value for key, value in odd.items() if not isinstance(value, dict)
+    }
