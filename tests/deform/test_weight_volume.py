@@ -3,10 +3,12 @@ import math
 import pytest
 import torch
 from little_body import JOINTS
+from torch.nn import functional as F
 
 from twofold.body.skeleton import PARENTS, joint_transforms
 from twofold.deform.weight_volume import (
     CanonicalBox,
+    Upsampling,
     WeightVolume,
     _bone_weights,
     _looked_up,
@@ -14,7 +16,6 @@ from twofold.deform.weight_volume import (
     canonical_box,
     skeletal_backward,
     skeletal_forward,
-    upsample,
 )
 from twofold.geometry.rotations import rigid_inverse
 
@@ -179,14 +180,23 @@ def test_compiled_lookup_is_that_of_torch_in_value_and_gradient(generator):
 
 @pytest.mark.parametrize("size", [1, 2, 4])
 def test_upsampling_is_the_transposed_convolution(size, generator):
-    layer = torch.nn.ConvTranspose3d(5, 3, 4, stride=2, padding=1).double()
+    layer = Upsampling(5, 3, 1.0, generator, from_one=size == 1).double()
+    layer.taps.data.normal_(generator=generator)
+    layer.bias.data.normal_(generator=generator)
+    weight = torch.zeros(5, 4, 4, 4, 3, dtype=torch.float64)
+    read = weight[:, 1:3, 1:3, 1:3] if size == 1 else weight
+    read.copy_(layer.taps.detach())
+    weight.requires_grad_()
     h = torch.randn(5, size, size, size, generator=generator, dtype=torch.float64, requires_grad=True)
-    found, expected = upsample(h.permute(1, 2, 3, 0), layer).permute(3, 0, 1, 2), layer(h[None])[0]
-    torch.testing.assert_close(found, expected)
-    mix = torch.randn(expected.shape, generator=generator, dtype=torch.float64)
-    inputs = [h, *layer.parameters()]
-    for a, b in zip(*(torch.autograd.grad((y * mix).sum(), inputs) for y in (found, expected)), strict=True):
-        torch.testing.assert_close(a, b)
+    literal = F.conv_transpose3d(h[None], weight.movedim(4, 1), layer.bias, stride=2, padding=1)[0]
+    found = layer(h.permute(1, 2, 3, 0)).permute(3, 0, 1, 2)
+    torch.testing.assert_close(found, literal)
+    mix = torch.randn(found.shape, generator=generator, dtype=torch.float64)
+    by_h, by_taps, by_bias = torch.autograd.grad((found * mix).sum(), [h, layer.taps, layer.bias])
+    expected = torch.autograd.grad((literal * mix).sum(), [h, weight, layer.bias])
+    torch.testing.assert_close(by_h, expected[0])
+    torch.testing.assert_close(by_bias, expected[2])
+    torch.testing.assert_close(by_taps, expected[1][:, 1:3, 1:3, 1:3] if size == 1 else expected[1])
 
 
 @pytest.fixture(scope="module")
@@ -208,9 +218,14 @@ def test_weights_are_the_prior_times_the_exponential_of_the_logits(volume):
 
 
 def test_all_phases_of_a_convolution_start_alike(volume):
-    weight = volume.upsampling[3].weight
+    taps = volume.upsampling[3].taps
     for phase in range(8):
         i, j, k = phase & 1, phase >> 1 & 1, phase >> 2 & 1
-        assert torch.equal(weight[:, :, i::2, j::2, k::2], weight[:, :, ::2, ::2, ::2])
+        assert torch.equal(taps[:, i::2, j::2, k::2], taps[:, ::2, ::2, ::2])
     bound = math.sqrt(3) * math.sqrt(2 / 1.04) * math.sqrt(2 / (8 * 256 + 8 * 256))
-    assert 0.99 * bound < weight.abs().max() <= bound * (1 + 1e-6)
+    assert 0.99 * bound < taps.abs().max() <= bound * (1 + 1e-6)
+
+
+def test_taps_that_nothing_reads_are_not_trained(volume):
+    frozen = {name for name, p in volume.named_parameters() if not p.requires_grad}
+    assert frozen == {"upsampling.0.unread"}

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from twofold.body.skeleton import PARENTS
-from twofold.geometry.rotations import cross_matrix, rigid_inverse, rigid_transform
+from twofold.geometry.rotations import rigid_inverse, rigid_transform, shortest_turn
 
 RIGID_PARTS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 13, 14, 15, 16, 17, 18, 19, 20, 21)
 """Joints whose boxes hold the person in DANBO and NPC: all but toes, neck and hands."""
@@ -173,8 +173,6 @@ def _children(joint: int) -> list[int]:
 def _rotation_to_z(direction: Tensor) -> Tensor:
     """The shortest rotation that takes a direction to +z; half a turn about x for -z."""
     identity = torch.eye(3, dtype=direction.dtype, device=direction.device)
-    unit = F.normalize(direction, dim=0)
-    if unit[2] < -1 + 1e-6:
+    if F.normalize(direction, dim=0)[2] < -1 + 1e-6:
         return identity * direction.new_tensor([1, -1, -1])
-    k = cross_matrix(torch.linalg.cross(unit, identity[2]))
-    return identity + k + k @ k / (1 + unit[2])
+    return shortest_turn(direction, identity[2])

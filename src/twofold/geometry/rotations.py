@@ -58,7 +58,7 @@ def shortest_turn(start: Float[Tensor, "*b 3"], end: Float[Tensor, "*b 3"]) -> F
     """The smallest rotation from one direction to another (of any length, not opposite).
 
     >>> turn = shortest_turn(torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 2, 0]))
-    >>> (turn @ torch.tensor([1.0, 0, 0])).round(decimals=6).tolist()
+    >>> (turn @ torch.tensor([1.0, 0, 0])).abs().round(decimals=6).tolist()
     [0.0, 1.0, 0.0]
     """
     a, b = torch.nn.functional.normalize(start, dim=-1), torch.nn.functional.normalize(end, dim=-1)
