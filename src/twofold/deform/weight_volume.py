@@ -199,7 +199,7 @@ class _AddTaps(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:  # type: ignore[override]
         padded = F.pad(grad_outputs[0], (0, 0, 1, 1, 1, 1, 1, 1))
         by_columns = padded.new_empty(ctx.shape)
         for k in itertools.product(range(4), repeat=3):
@@ -312,7 +312,7 @@ class _BoneLookup(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
         weights, points, rows = ctx.saved_tensors
         arrays = [t.detach().contiguous().numpy() for t in (points, rows, weights, grad_outputs[0])]
         by_weights, by_rows = torch.zeros_like(weights), torch.zeros_like(rows)
