@@ -9,7 +9,14 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
 
+from twofold.errors import TwofoldError
 from twofold.files import write_atomically
+
+ALPHA_CODECS: dict[str, tuple[str, str, dict[str, str]]] = {
+    ".webm": ("libvpx-vp9", "yuva420p", {"crf": "24", "b": "0", "cpu-used": "4", "row-mt": "1"}),
+    ".mov": ("prores_ks", "yuva444p10le", {"profile": "4444"}),
+}
+"""Codec, pixels and options of videos with opacity: browsers play WebM, video editors read MOV."""
 
 QUALITY = "18"
 """x264's constant rate factor: lower is better and larger; at 18 a loss is hard to see."""
@@ -48,6 +55,39 @@ def write_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 3"]], 
             padded = np.pad(picture, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
             frame = av.VideoFrame.from_ndarray(padded, format="rgb24")
             limited = frame.reformat(format="yuv420p", dst_colorspace=matrix, dst_color_range=ColorRange.MPEG)
+            file.mux(stream.encode(limited))
+        if stream is None:
+            raise ValueError("a video needs at least one frame")
+        file.mux(stream.encode())
+
+
+def write_alpha_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 4"]], fps: float | int) -> None:
+    """Writes frames with opacity as they come: VP9 in a WebM, ProRes 4444 in a MOV (Apple's QuickTime).
+
+    Args:
+        path: ends in a key of `ALPHA_CODECS`.
+        frames: straight (not premultiplied) colour and opacity, all of one size.
+        fps: frames per second.
+
+    Raises:
+        ValueError: there is no frame.
+        TwofoldError: the file cannot be written, or the library lacks the codec.
+    """
+    ending = Path(path).suffix.lower()
+    codec, pixels, options = ALPHA_CODECS[ending]
+    if codec not in av.codecs_available:
+        raise TwofoldError(f"The installed PyAV lacks {codec}, which {ending} with opacity needs; name a folder instead.")
+    with write_atomically(path) as temporary, av.open(str(temporary), "w") as file:
+        stream = None
+        for image in frames:
+            if stream is None:
+                stream = file.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
+                stream.height, stream.width = image.shape[0] + image.shape[0] % 2, image.shape[1] + image.shape[1] % 2
+                stream.pix_fmt, stream.options = pixels, options
+                stream.codec_context.colorspace = Colorspace.ITU709
+            padded = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
+            frame = av.VideoFrame.from_ndarray(padded, format="rgba")
+            limited = frame.reformat(format=pixels, dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)
             file.mux(stream.encode(limited))
         if stream is None:
             raise ValueError("a video needs at least one frame")

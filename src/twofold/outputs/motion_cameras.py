@@ -1,0 +1,83 @@
+"""Cameras that keep a moving person in view: one that stands still, or one that goes along smoothly."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor
+
+from twofold.body.motion import Motion, joint_frames
+from twofold.geometry.cameras import Camera
+from twofold.outputs.views import look_at
+
+AROUND = 0.22
+"""Room around the joints, metres: head, hands and clothes reach beyond them."""
+
+_FOCAL = 1.9
+"""Focal length in picture heights: a field of view of 29 degrees, as a portrait has."""
+
+_FILLED = 0.92
+"""Share of the image that the person may take up."""
+
+_FOLLOWED_WITHIN = 0.5
+"""Seconds within which a camera that goes along evens out the person's path (standard deviation)."""
+
+
+def motion_cameras(
+    joints: Float[Tensor, "24 3"],
+    motion: Motion,
+    size: int,
+    follow: bool = False,
+    side: float = 0.44,
+    above: float = 0.12,
+) -> list[Camera]:
+    """A camera for every frame, in front of where the person faces at first, the whole person in view in every frame.
+
+    Args:
+        joints: of the body's T-pose, metres.
+        motion: what it does, y up.
+        size: edge of the square images, pixels.
+        follow: go along with the person; else one camera stands where it sees the whole motion.
+        side: angle of the camera from the person's front to its left, radians.
+        above: angle from which it looks down, radians.
+    """
+    rotations, positions = joint_frames(joints, motion)
+    ahead = rotations[: max(1, round(0.5 * motion.fps)), 0, :, 2].mean(0)
+    yaw = math.atan2(float(ahead[0]), float(ahead[2])) + side
+    toward = torch.tensor(
+        [math.sin(yaw) * math.cos(above), math.sin(above), math.cos(yaw) * math.cos(above)], dtype=torch.float64
+    )
+    view = look_at(toward, torch.zeros_like(toward), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))[:3, :3].double()
+    corners = torch.cartesian_prod(*[torch.tensor([-AROUND, AROUND], dtype=torch.float64)] * 3)
+    low, high = positions.amin(1), positions.amax(1)
+    if follow:
+        middle = (low + high) / 2
+        middle[:, 1] = middle[:, 1].median()
+        centers = _smoothed(middle, _FOLLOWED_WITHIN * motion.fps)
+    else:
+        centers = ((low.amin(0) + high.amax(0)) / 2).expand(len(motion), 3)
+    points = ((positions - centers[:, None])[:, :, None] + corners).flatten(1, 2) @ view.T
+    if not follow:  # The middle of what is seen, which is nearer to the camera on one side.
+        shift = (points[..., :2].amax((0, 1)) + points[..., :2].amin((0, 1))) / 2
+        moved = shift @ view[:2]
+        centers, points = centers + moved, points - torch.cat([shift, torch.zeros(1).to(shift)])
+    slope = _FILLED * 0.5 / _FOCAL
+    away = float((points[..., :2].abs() / slope - points[..., 2:]).max())
+    focal = _FOCAL * size
+    intrinsics = torch.tensor([[focal, 0.0, (size - 1) / 2], [0.0, focal, (size - 1) / 2], [0.0, 0.0, 1.0]])
+    cameras: list[Camera] = []
+    for center in centers:
+        transform = torch.eye(4, dtype=torch.float64)
+        transform[:3, :3], transform[:3, 3] = view, -view @ (center + away * toward)
+        cameras.append(Camera(transform.float(), intrinsics, size, size))
+    return cameras
+
+
+def _smoothed(path: Float[Tensor, "T 3"], deviation: float) -> Float[Tensor, "T 3"]:
+    """A path evened out; its ends go on as they came, so that a walker does not leave the middle there."""
+    width = min(len(path) - 1, math.ceil(4 * deviation))
+    padded = np.pad(path.numpy(), ((width, width), (0, 0)), mode="reflect", reflect_type="odd")
+    filtered = gaussian_filter1d(padded, deviation, axis=0, mode="nearest")
+    return torch.from_numpy(filtered[width : width + len(path)].copy())
