@@ -82,7 +82,9 @@ def kept_contacts(
     wanted = toes.double() - torch.tensor([0.0, _floor(toes, rests) - rise, 0.0])
     changes = torch.stack([_corrections(wanted[:, s], own[:, s], rests[:, s].numpy(), still) for s in (0, 1)], 1)
     root = _shared(changes, rests, motion.fps)
-    ankles = positions[:, list(ANKLES)] + changes
+    # A foot in the air goes with the pelvis; only what it has to make up for on the floor is passed on.
+    apart = torch.stack([_between(changes[:, s] - root, rests[:, s].numpy()) for s in (0, 1)], 1)
+    ankles = positions[:, list(ANKLES)] + root[:, None] + apart
     root = root - _lowering(positions + root[:, None], ankles, rests, motion.fps)[:, None] * torch.tensor([0.0, 1, 0])
     turned = reach(rotations, positions + root[:, None], ankles)
     poses, moved = local_poses(turned), motion.translations.double() + root
@@ -103,15 +105,21 @@ def _corrections(
     rest to the next.
     """
     known = (wanted - own).numpy().copy()
-    runs = _runs(rests)
-    if not runs:
-        return torch.zeros_like(own)
-    for first, end in runs:
+    for first, end in _runs(rests):
         path = wanted[first:end].numpy()
         stray = path - path.mean(0)
         far = np.linalg.norm(stray, axis=1, keepdims=True)
         known[first:end] -= stray * np.minimum(1, still / np.maximum(far, 1e-12))
         known[first:end, [0, 2]] -= known[first:end, [0, 2]].mean(0)
+    return _between(torch.from_numpy(known), rests)
+
+
+def _between(values: Float[Tensor, "T 3"], rests: Bool[np.ndarray, "T"]) -> Float[Tensor, "T 3"]:
+    """The values of resting frames, passing smoothly from one rest to the next; zero where there is no rest at all."""
+    runs = _runs(rests)
+    if not runs:
+        return torch.zeros_like(values)
+    known = values.numpy().copy()
     known[: runs[0][0]], known[runs[-1][1] :] = known[runs[0][0]], known[runs[-1][1] - 1]
     for (_, end), (following, _) in itertools.pairwise(runs):
         share = np.linspace(0, 1, following - end + 2)[1:-1, None]

@@ -1,4 +1,4 @@
-"""The command line: `twofold studio`, `import`, `prepare`, `check`, `train`, `render`, `evaluate`, `demo`.
+"""The command line: `twofold studio`, `import`, `prepare`, `check`, `train`, `render`, `motion`, `evaluate`, `demo`.
 
 What a command needs is imported when it runs, so that `--help` answers at once.
 """
@@ -16,6 +16,7 @@ import tyro
 from twofold import __version__
 from twofold.cli.captures import check, import_capture, prepare, studio
 from twofold.cli.console import ALONE, bar, console, say, within
+from twofold.cli.motions import NO_MOTION, MotionView, motion, render_motion
 from twofold.cli.streams import streams_that_never_fail
 from twofold.errors import TwofoldError
 
@@ -135,23 +136,30 @@ def render(
     out: Path | None = None,
     chunk: int | None = None,
     device: str = "auto",
+    motion_video: Annotated[MotionView, tyro.conf.OmitArgPrefixes] = NO_MOTION,
 ) -> None:
-    """Draws an avatar: an orbit, unseen views, unseen poses, front and back; branches, normals, opacity.
+    """Draws an avatar: an orbit, unseen views, unseen poses, front and back; branches, normals, opacity; or a motion.
 
     Args:
         run: Run folder.
         what: Everything, or one part.
         size: Rows of the pictures of the orbit and of the canonical pose, 16 to 4096.
         capture: Capture folder, if it has moved since training.
-        out: Folder for the pictures; by default RUN/renders.
+        out: Folder for the pictures; by default RUN/renders. With --motion a video or a folder.
         chunk: Rays at once; by default as many as the free memory holds.
         device: auto, cpu, cuda or cuda:N.
+        motion_video: A video of a motion; the others need --motion.
     """
     from twofold.capture.folder import read_capture
     from twofold.outputs.gallery import render_run
     from twofold.training.run import choose_device, find_capture, load, require_same
 
     within(size=(size, 16, 4096), chunk=(chunk, 1, None))
+    if motion_video.motion is not None:
+        render_motion(run, motion_video, size, out, chunk, device)
+        return
+    if motion_video != NO_MOTION:
+        raise TwofoldError("--follow, --fps, --up, --units, --start-at-origin, --background and --alpha need --motion.")
     avatar, _ = load(run, choose_device(device))
     read = read_capture(find_capture(run, capture))
     require_same(run, read, motion=False)
@@ -224,6 +232,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "render": render,
     "evaluate": evaluate,
+    "motion": motion,
 }
 
 

@@ -9,11 +9,15 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from twofold.body.motion import Motion, joint_frames
+from twofold.body.skeleton import PARENTS, ShapedBody
 from twofold.geometry.cameras import Camera
 from twofold.outputs.views import look_at
 
-AROUND = 0.22
-"""Room around the joints, metres: head, hands and clothes reach beyond them."""
+_CLOTHES = 0.07
+"""Room around the bare body, metres."""
+
+_THICK = 0.18
+"""How far a body reaches around an inner joint at most, metres."""
 
 _FOCAL = 1.9
 """Focal length in picture heights: a field of view of 29 degrees, as a portrait has."""
@@ -26,7 +30,7 @@ _FOLLOWED_WITHIN = 0.5
 
 
 def motion_cameras(
-    joints: Float[Tensor, "24 3"],
+    body: ShapedBody,
     motion: Motion,
     size: int,
     follow: bool = False,
@@ -36,35 +40,38 @@ def motion_cameras(
     """A camera for every frame, in front of where the person faces at first, the whole person in view in every frame.
 
     Args:
-        joints: of the body's T-pose, metres.
+        body: who moves, in the T-pose.
         motion: what it does, y up.
         size: edge of the square images, pixels.
         follow: go along with the person; else one camera stands where it sees the whole motion.
         side: angle of the camera from the person's front to its left, radians.
         above: angle from which it looks down, radians.
     """
-    rotations, positions = joint_frames(joints, motion)
+    rotations, positions = joint_frames(body.joints, motion)
     ahead = rotations[: max(1, round(0.5 * motion.fps)), 0, :, 2].mean(0)
     yaw = math.atan2(float(ahead[0]), float(ahead[2])) + side
     toward = torch.tensor(
         [math.sin(yaw) * math.cos(above), math.sin(above), math.cos(yaw) * math.cos(above)], dtype=torch.float64
     )
-    view = look_at(toward, torch.zeros_like(toward), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))[:3, :3].double()
-    corners = torch.cartesian_prod(*[torch.tensor([-AROUND, AROUND], dtype=torch.float64)] * 3)
-    low, high = positions.amin(1), positions.amax(1)
+    view = look_at(toward, torch.zeros_like(toward), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))[
+        :3, :3
+    ].double()
+    around = _joint_reaches(body).double()
+    low, high = (positions - around[:, None]).amin(1), (positions + around[:, None]).amax(1)
     if follow:
         middle = (low + high) / 2
         middle[:, 1] = middle[:, 1].median()
         centers = _smoothed(middle, _FOLLOWED_WITHIN * motion.fps)
     else:
         centers = ((low.amin(0) + high.amax(0)) / 2).expand(len(motion), 3)
-    points = ((positions - centers[:, None])[:, :, None] + corners).flatten(1, 2) @ view.T
+    points = (positions - centers[:, None]) @ view.T
     if not follow:  # The middle of what is seen, which is nearer to the camera on one side.
-        shift = (points[..., :2].amax((0, 1)) + points[..., :2].amin((0, 1))) / 2
+        wide = around[:, None]
+        shift = ((points[..., :2] + wide).amax((0, 1)) + (points[..., :2] - wide).amin((0, 1))) / 2
         moved = shift @ view[:2]
         centers, points = centers + moved, points - torch.cat([shift, torch.zeros(1).to(shift)])
     slope = _FILLED * 0.5 / _FOCAL
-    away = float((points[..., :2].abs() / slope - points[..., 2:]).max())
+    away = float(((points[..., :2].abs() + around[:, None]) / slope - points[..., 2:]).max())
     focal = _FOCAL * size
     intrinsics = torch.tensor([[focal, 0.0, (size - 1) / 2], [0.0, focal, (size - 1) / 2], [0.0, 0.0, 1.0]])
     cameras: list[Camera] = []
@@ -81,3 +88,13 @@ def _smoothed(path: Float[Tensor, "T 3"], deviation: float) -> Float[Tensor, "T 
     padded = np.pad(path.numpy(), ((width, width), (0, 0)), mode="reflect", reflect_type="odd")
     filtered = gaussian_filter1d(padded, deviation, axis=0, mode="nearest")
     return torch.from_numpy(filtered[width : width + len(path)].copy())
+
+
+def _joint_reaches(body: ShapedBody) -> Float[Tensor, "24"]:
+    """How far the body reaches around each joint, metres: balls around the joints hold it in every pose."""
+    owner = body.weights.argmax(1)
+    far = (body.vertices - body.joints[owner]).norm(dim=-1)
+    reaches = torch.zeros(24).scatter_reduce(0, owner, far, "amax")
+    # A bone's far end has a ball of its own, but for the head, the hands and the toes.
+    inner = torch.tensor([joint in PARENTS for joint in range(24)])
+    return torch.where(inner, reaches.clamp_max(_THICK), reaches) + _CLOTHES

@@ -26,9 +26,7 @@ VIDEO_ENDINGS = (".mp4", ".webm", ".mov")
 
 @dataclass(frozen=True)
 class View:
-    """An image of a frame: colour times opacity (that is, on black), opacity, and what stands behind, where not a plain
-    colour.
-    """
+    """An image of a frame: colour times opacity (that is, on black), opacity, what stands behind (None: a colour)."""
 
     color: Float[Tensor, "h w 3"]
     opacity: Float[Tensor, "h w"]
@@ -47,6 +45,15 @@ class View:
 
 Renderer = Callable[[Float[Tensor, "24 3"], Float[Tensor, "3"], Camera], View]
 """Makes the view of a pose (axis-angle, and translation) from a camera. A baked mesh is another one of these."""
+
+
+@torch.no_grad()
+def rest_body(avatar: Avatar) -> ShapedBody:
+    """The body of an avatar in the T-pose, for reading motions onto it and placing cameras (on the CPU)."""
+    posed = avatar.pose(torch.zeros(24, 3), torch.zeros(3)).body
+    parts = (posed.vertices, posed.joints, posed.faces, posed.weights)
+    vertices, joints, faces, weights = (part.detach().cpu() for part in parts)
+    return ShapedBody(vertices, joints, faces, weights, vertices.new_zeros(len(vertices), 3, 0))
 
 
 def field_renderer(avatar: Avatar, chunk: int | None = None) -> Renderer:
@@ -100,9 +107,7 @@ def require_video_path(path: Path, alpha: bool) -> None:
     """
     ending = path.suffix.lower()
     if ending and ending not in VIDEO_ENDINGS:
-        raise TwofoldError(
-            f"--out should end in {', '.join(VIDEO_ENDINGS)} or be a folder for images, it is {path}."
-        )
+        raise TwofoldError(f"--out should end in {', '.join(VIDEO_ENDINGS)} or be a folder for images, it is {path}.")
     if alpha and ending == ".mp4":
         raise TwofoldError("An MP4 holds no opacity; with --alpha let --out end in .webm or .mov, or name a folder.")
     if path.exists() and path.is_dir() == bool(ending):
@@ -118,6 +123,7 @@ def write_motion(
     background: Float[Tensor, "3"],
     alpha: bool = False,
     progress: Callable[[float], None] = lambda _: None,
+    replace: bool = False,
 ) -> None:
     """Renders a motion into a video (by the ending of `path`) or a folder of PNG images, whole or not at all.
 
@@ -129,6 +135,7 @@ def write_motion(
         background: colour behind, 0..1.
         alpha: keep the opacity instead of a background.
         progress: told the share that is done.
+        replace: overwrite a folder that holds files.
 
     Raises:
         TwofoldError: the place cannot be written to.
@@ -146,6 +153,6 @@ def write_motion(
             path.parent.mkdir(parents=True, exist_ok=True)
         (write_alpha_video if alpha else write_video)(path, views(), motion.fps)
         return
-    with new_folder(path, replace=True) as folder:
+    with new_folder(path, replace) as folder:
         for index, image in enumerate(views()):
             Image.fromarray(image).save(folder / f"{index:06d}.png")

@@ -76,7 +76,9 @@ def write_alpha_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 
     ending = Path(path).suffix.lower()
     codec, pixels, options = ALPHA_CODECS[ending]
     if codec not in av.codecs_available:
-        raise TwofoldError(f"The installed PyAV lacks {codec}, which {ending} with opacity needs; name a folder instead.")
+        raise TwofoldError(
+            f"The installed PyAV lacks {codec}, which {ending} with opacity needs; name a folder instead."
+        )
     with write_atomically(path) as temporary, av.open(str(temporary), "w") as file:
         stream = None
         for image in frames:

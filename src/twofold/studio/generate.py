@@ -19,13 +19,13 @@ from scipy import sparse
 
 from twofold.body.anny import anny_body
 from twofold.body.skeleton import Body, PosedBody, ShapedBody, pose_body, shape_body
+from twofold.body.stances import choreograph
 from twofold.capture.folder import CaptureWriter
 from twofold.config import MOST_SEED
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.raster import box_filter, rasterize, supersampled
 from twofold.geometry.surfaces import vertex_normals
-from twofold.studio.animation import choreograph
 from twofold.studio.appearance import Look, draw_look
 from twofold.studio.figure import Figure, build_figure
 from twofold.studio.lighting import Beads, cast_shade, illuminate, thread_beads
