@@ -83,7 +83,7 @@ def read_bytes(path: Path | str, limit: int) -> bytes:
     """
     with opened(path, limit) as file:
         try:
-            return file.read(limit)
+            return file.read(os.fstat(file.fileno()).st_size)
         except OSError as error:
             raise TwofoldError(f"{path} {why_unreadable(error)}.") from error
 

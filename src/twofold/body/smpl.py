@@ -5,10 +5,11 @@ only written down: what it claims to be, with which arguments and which state. N
 records.
 """
 
+import io
 import pickle
+import pickletools
 import re
-import zipfile
-import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,8 +17,21 @@ import numpy as np
 
 from twofold.body.skeleton import PARENTS, Body
 from twofold.errors import TwofoldError
+from twofold.inputs import is_there, read_bytes, shown_path
+from twofold.npz import read_npz
 
 SHAPES = 10
+_MAX_BYTES = 2**30
+"""Four times the largest of these files."""
+_MAX_OPCODES, _MAX_ORIGINS = 1_000_000, 100
+"""Of a pickle; the distributed ones have some thousand and some twenty."""
+_MAX_CELLS = 10_000_000
+"""Of a sparse matrix: 24 joints by 400,000 vertices."""
+_COUNTED = {
+    pickletools.TAKEN_FROM_ARGUMENT1: 1, pickletools.TAKEN_FROM_ARGUMENT4: 4, pickletools.TAKEN_FROM_ARGUMENT4U: 4,
+    pickletools.TAKEN_FROM_ARGUMENT8U: 8,
+}  # fmt: skip
+"""Bytes that say how long an opcode's argument is."""
 _NEEDED = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 _OTHER_BODIES = {52: "SMPL-H", 55: "SMPL-X", 16: "MANO hand", 5: "FLAME head"}
 _SOURCE = "smpl.is.tue.mpg.de offers it as basicmodel_*_lbs_10_207_0_v1.1.0.pkl"
@@ -44,7 +58,8 @@ def read_smpl(path: Path | str) -> Body:
             do not fit together.
     """
     path = Path(path)
-    arrays = _npz_arrays(path) if _is_zip(path) else _pickle_arrays(path)
+    raw = _content(path)
+    arrays = _npz_arrays(path) if raw[:4] in (b"PK\3\4", b"PK\5\6") else _pickle_arrays(path, raw)
     joints = _joint_count(arrays)
     if joints is not None and joints != len(PARENTS):
         other = _OTHER_BODIES.get(joints, "another body")
@@ -93,27 +108,25 @@ def _joint_count(arrays: dict[str, np.ndarray]) -> int | None:
     return weights.shape[1] if weights is not None and weights.ndim == 2 else None
 
 
-def _is_zip(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(4) in (b"PK\3\4", b"PK\5\6")
-    except FileNotFoundError as error:
-        raise TwofoldError(f"{path} is missing, expected your SMPL file; {_SOURCE}.") from error
-    except IsADirectoryError as error:
-        raise TwofoldError(f"{path} is a folder, expected the SMPL file itself; name a file in it.") from error
-    except OSError as error:
-        raise TwofoldError(f"{path} cannot be read ({error.strerror}); check the disk and its permissions.") from error
+def _content(path: Path) -> bytes:
+    """The whole file."""
+    if not is_there(path):
+        raise TwofoldError(f"{shown_path(path)} is missing, expected your SMPL file; {_SOURCE}.")
+    if path.is_dir():
+        raise TwofoldError(f"{path} is a folder, expected the SMPL file itself; name a file in it.")
+    return read_bytes(path, _MAX_BYTES)
 
 
 def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
     """The needed arrays of an npz; the rest may hold Python objects and is not touched."""
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in _NEEDED if name in archive.files}
-    except ValueError as error:
-        raise TwofoldError(f"{path} holds Python objects, expected plain arrays; use the .pkl file instead.") from error
-    except (OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        raise TwofoldError(f"{path} is damaged or cut short; get the file again.") from error
+        return read_npz(path, _NEEDED)
+    except TwofoldError as error:
+        if "Python objects" in str(error):
+            what = "holds Python objects, expected plain arrays; use the .pkl file instead"
+        else:
+            what = "is damaged or cut short; get the file again"
+        raise TwofoldError(f"{path} {what}.") from error
 
 
 class _Forbidden(Exception):
@@ -158,18 +171,77 @@ class _Record:
 class _RecordingUnpickler(pickle.Unpickler):
     """Makes records instead of objects. It never imports a module and never calls what a pickle names."""
 
+    def __init__(self, raw: bytes) -> None:
+        """Text of Python 2 is read as latin-1, so that bytes in it stay what they are."""
+        super().__init__(io.BytesIO(raw), encoding="latin1")
+        self._known: dict[str, type[_Record]] = {}
+
     def find_class(self, module_name: str, global_name: str, /) -> type[_Record]:
         """A class of records for the named thing, or `_Forbidden`."""
         origin = f"{module_name}.{global_name}"
         if not _HARMLESS.fullmatch(origin):
             raise _Forbidden(origin)
-        return type("_RecordOf", (_Record,), {"origin": origin})
+        if origin not in self._known:
+            if len(self._known) == _MAX_ORIGINS:
+                raise ValueError("it names too many things")
+            self._known[origin] = type("_RecordOf", (_Record,), {"origin": origin})
+        return self._known[origin]
 
 
-def _pickle_arrays(path: Path) -> dict[str, np.ndarray]:
+def _require_modest(raw: bytes) -> None:
+    """Refuses pickles that would take far more memory than they are large, as no SMPL file does.
+
+    Every opcode may make an object, and one that stores in the memo makes the unpickler's table as long as its number.
+
+    Raises:
+        ValueError: there are too many opcodes, a number in the memo is skipped, or it is no pickle.
+        EOFError: it ends early.
+    """
+    stored = 0
+    for count, (name, argument) in enumerate(_opcodes(raw)):
+        if count > _MAX_OPCODES:
+            raise ValueError("it has too many parts")
+        if name.endswith("PUT"):
+            place = int(argument[:12]) if name == "PUT" else int.from_bytes(argument, "little")
+            if not 0 <= place <= stored + 1:
+                raise ValueError("its memo has holes")
+            stored = max(stored, place + 1)
+
+
+def _opcodes(raw: bytes) -> Iterator[tuple[str, bytes]]:
+    """Name and argument of every opcode up to the first STOP.
+
+    As pickletools has them, which itself stumbles over the bytes that Python 2 wrote into text.
+    """
+    place = 0
+    while True:
+        opcode = pickletools.code2op.get(raw[place : place + 1].decode("latin1"))
+        if opcode is None:
+            raise EOFError if place >= len(raw) else ValueError("an unknown opcode")
+        place += 1
+        size = 0 if opcode.arg is None else opcode.arg.n
+        if size == pickletools.UP_TO_NEWLINE:
+            end = place
+            for _ in range(2 if opcode.name in ("GLOBAL", "INST") else 1):
+                end = raw.index(b"\n", end) + 1
+        elif size >= 0:
+            end = place + size
+        else:
+            width = _COUNTED[size]
+            place += width
+            end = place + int.from_bytes(raw[place - width : place], "little")
+        if end > len(raw):
+            raise EOFError
+        yield opcode.name, raw[place:end]
+        if opcode.name == "STOP":
+            return
+        place = end
+
+
+def _pickle_arrays(path: Path, raw: bytes) -> dict[str, np.ndarray]:
     try:
-        with path.open("rb") as file:
-            content = _RecordingUnpickler(file, encoding="latin1").load()
+        _require_modest(raw)
+        content = _RecordingUnpickler(raw).load()
     except _Forbidden as error:
         raise TwofoldError(
             f"{path} would run {error} when opened as usual, which no SMPL file does; nothing was run, do not trust it."
@@ -246,8 +318,15 @@ def _raw_bytes(value: object) -> bytes:
 def _dense(state: dict[str, Any], by_column: bool) -> np.ndarray:
     """A compressed sparse matrix as a full one; entries given twice add up."""
     rows, columns = (int(n) for n in state["_shape" if "_shape" in state else "shape"])
-    data, inner, starts = (_array(state[name]) for name in ("data", "indices", "indptr"))
-    outer = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    data, inner, starts = (_array(state[name]).ravel() for name in ("data", "indices", "indptr"))
+    counts = np.diff(starts)
+    if min(rows, columns) < 0 or rows * columns > _MAX_CELLS or len(starts) - 1 > max(rows, columns):
+        raise ValueError(f"a sparse matrix of {rows} x {columns} is none of SMPL's")
+    if starts.dtype.kind not in "iu" or starts[0] != 0 or starts[-1] != len(data) or counts.min(initial=0) < 0:
+        raise ValueError("a sparse matrix does not fit its own numbers")
+    if len(inner) != len(data) or inner.min(initial=0) < 0:
+        raise ValueError("a sparse matrix points outside itself")
+    outer = np.repeat(np.arange(len(counts)), counts)
     dense = np.zeros((rows, columns))
     np.add.at(dense, (inner, outer) if by_column else (outer, inner), data)
     return dense

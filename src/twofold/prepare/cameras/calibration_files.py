@@ -4,7 +4,6 @@ OpenCV's YAML is read by a few lines of our own: PyYAML refuses its version line
 like 1e-05 for words, and only keys with numbers, names and matrices are needed.
 """
 
-import importlib
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -15,9 +14,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from twofold.capture.layout import intrinsics_faults, rigid_faults
+from twofold.capture.layout import MAX_SIDE, intrinsics_faults, rigid_faults
 from twofold.errors import TwofoldError
-from twofold.inputs import read_json
+from twofold.inputs import read_json, read_text, read_toml
+from twofold.npz import are_moderate
 from twofold.prepare.cameras.calibration import CalibratedCamera
 
 KNOWN = (
@@ -64,13 +64,10 @@ def _reader(path: Path) -> Callable[[Path], dict[str, CalibratedCamera]]:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_bytes().decode("utf-8")
-    except FileNotFoundError as error:
-        raise TwofoldError(f"{path} is missing; give {KNOWN}.") from error
-    except UnicodeDecodeError as error:
-        raise TwofoldError(f"{path} is not text; give {KNOWN}.") from error
-    except OSError as error:
-        raise TwofoldError(f"{path} cannot be read ({error.strerror or error}); check it.") from error
+        return read_text(path)
+    except TwofoldError as error:
+        text = str(error).removesuffix(".").removesuffix("; save it as such")
+        raise TwofoldError(f"{text}; give {KNOWN}.") from error
 
 
 def _camera(
@@ -83,7 +80,8 @@ def _camera(
     faults += intrinsics_faults(k if k is not None and k.shape == (3, 3) else None, width or 0)
     if given is None or given.size not in (4, 5, 8, 12, 14) or given.ravel()[5:].any():
         faults.append("the distortion should be OpenCV's k1, k2, p1, p2 and k3; undistort the videos first.")
-    if (height is not None and height < 1) or (width is not None and width < 1):
+    sides = [side for side in size if side is not None]
+    if min(sides, default=1) < 1 or max(sides, default=1) > MAX_SIDE:
         faults.append(f"its pictures have {width}x{height} pixels; give their size.")
     if faults or k is None or given is None or rigid is None:
         raise TwofoldError(f"{where}: camera {name}: {faults[0]}")
@@ -99,7 +97,7 @@ def _numbers(value: Any) -> np.ndarray | None:
         array = np.array(value)
     except ValueError:  # rows of unequal length
         return None
-    return array.astype(np.float64) if array.dtype.kind in "fiu" and np.isfinite(array).all() else None
+    return array.astype(np.float64) if array.dtype.kind in "fiu" and are_moderate(array) else None
 
 
 def _rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -118,8 +116,9 @@ def _read_qualisys(path: Path) -> dict[str, CalibratedCamera]:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise TwofoldError(f"{path} defines entities of its own, which are never followed; take them out.")
     try:
-        root = ET.fromstring(text.lstrip("\ufeff \t\r\n").encode())
-    except ET.ParseError as error:
+        # As text, so that no other encoding is believed that it may claim.
+        root = ET.fromstring(text.lstrip("\ufeff \t\r\n"))
+    except (ET.ParseError, LookupError, ValueError) as error:
         raise TwofoldError(f"{path} is no valid XML ({error}); export the calibration again.") from error
     cameras: dict[str, CalibratedCamera] = {}
     for entry in root.iter("camera"):
@@ -145,7 +144,10 @@ def _read_qualisys(path: Path) -> dict[str, CalibratedCamera]:
 def _attributes(path: Path, camera: str, entry: ET.Element, tag: str, keys: list[str]) -> np.ndarray:
     child = entry.find(tag)
     try:
-        return np.array([float((child.attrib if child is not None else {})[key]) for key in keys])
+        numbers = np.array([float((child.attrib if child is not None else {})[key]) for key in keys])
+        if not are_moderate(numbers):
+            raise ValueError("not finite")
+        return numbers
     except (KeyError, ValueError) as error:
         raise TwofoldError(
             f"{path}: camera {camera or '?'}: {tag} should give {', '.join(keys)} as numbers; export it again."
@@ -191,7 +193,7 @@ def _sibling(folder: Path, stem: str) -> Path:
 
 def _whole(value: Any) -> int | None:
     numbers = _numbers(value)
-    return round(numbers.item()) if numbers is not None and numbers.size == 1 else None
+    return round(float(numbers.item())) if numbers is not None and numbers.size == 1 else None
 
 
 _KEY = re.compile(r"""^["']?([^\s"':#%-][^"':]*)["']?\s*:(?:\s+(.*))?$""")
@@ -220,7 +222,7 @@ def parse_opencv(text: str) -> dict[str, np.ndarray | list[str] | float | str]:
 
 def _value(text: str) -> np.ndarray | list[str] | float | str:
     if text.startswith("!!opencv-matrix"):
-        size = [re.search(rf"^{key}:\s*(\d+)", text, re.MULTILINE) for key in ("rows", "cols")]
+        size = [re.search(rf"^{key}:\s*(\d{{1,9}})\b", text, re.MULTILINE) for key in ("rows", "cols")]
         data = re.search(r"data:\s*\[(.*?)\]", text, re.DOTALL)
         numbers = [_number(word) for word in re.split(r"[,\s]+", data[1].strip())] if data else []
         rows, columns = (int(match[1]) if match else 0 for match in size)
@@ -246,17 +248,7 @@ def _bare(word: str) -> str:
 
 def _read_toml(path: Path) -> dict[str, CalibratedCamera]:
     """Pose2Sim's Calib.toml: one table a camera; Rodrigues rotation and translation from world to camera, metres."""
-    try:
-        toml = importlib.import_module("tomllib")  # Python 3.11 and later
-    except ImportError:
-        try:
-            toml = importlib.import_module("tomli")
-        except ImportError as error:
-            raise TwofoldError(f"{path} needs Python 3.11 or `pip install tomli`; do one of them.") from error
-    try:
-        tables: dict[str, Any] = toml.loads(_text(path))
-    except toml.TOMLDecodeError as error:
-        raise TwofoldError(f"{path} is not valid TOML ({error}); correct it there.") from error
+    tables = read_toml(path)
     cameras: dict[str, CalibratedCamera] = {}
     for key, table in tables.items():
         if not isinstance(table, dict) or "matrix" not in table:
