@@ -14,7 +14,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twofold.errors import TwofoldError
-from twofold.files import json_text, new_folder, plain_errors, write_atomically, write_bytes, write_json, write_npz
+from twofold.files import (
+    json_text,
+    made_folder,
+    new_folder,
+    plain_errors,
+    write_atomically,
+    write_bytes,
+    write_json,
+    write_npz,
+    write_together,
+)
 from twofold.inputs import read_json
 from twofold.npz import read_npz
 
@@ -346,3 +356,38 @@ def test_a_single_array_is_no_npz(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros(3))
     with pytest.raises(TwofoldError, match="single array"):
         read_npz(tmp_path / "a.npy")
+
+
+@posix_only
+def test_files_that_belong_together_are_all_written_or_none(tmp_path):
+    write_together(tmp_path / "a" / "b", {"one": b"1", "two": b"2"})
+    with pytest.raises(TwofoldError, match=r"Cannot write .*large"), file_size_limit(1000):
+        write_together(tmp_path / "a" / "b", {"one": b"new", "large": b"x" * 10000})
+    assert {p.name: p.read_bytes() for p in (tmp_path / "a" / "b").iterdir()} == {"one": b"1", "two": b"2"}
+    with pytest.raises(TwofoldError, match=r"Cannot write .*large"), file_size_limit(1000):
+        write_together(tmp_path / "c" / "d", {"one": b"new", "large": b"x" * 10000})
+    assert os.listdir(tmp_path) == ["a"]
+
+
+def test_a_folder_made_for_nothing_goes_again_and_one_with_something_in_it_stays(tmp_path):
+    def fails(folder, *inside):
+        with made_folder(folder):
+            for name in inside:
+                (folder / name).parent.mkdir(exist_ok=True)
+                (folder / name).write_bytes(b"x")
+            (folder / "empty").mkdir()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fails(tmp_path / "a" / "b")
+    assert os.listdir(tmp_path) == []
+    with pytest.raises(KeyboardInterrupt):
+        fails(tmp_path / "a" / "b", "orbit/0.png")
+    left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*"))
+    assert left == ["a", "a/b", "a/b/orbit", "a/b/orbit/0.png"]
+
+
+def test_names_of_files_that_are_no_text_come_back_from_json(tmp_path):
+    odd = os.fsdecode(b"caf\xe9")
+    write_json(tmp_path / "a.json", {"capture": odd, "name": "é"})
+    assert read_json(tmp_path / "a.json") == {"capture": odd, "name": "é"}

@@ -12,14 +12,15 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from twofold.errors import TwofoldError
+from twofold.inputs import shown_path
 
-_ADVICE = {
+ADVICE = {
     errno.EACCES: "there is no permission; choose another place or change its permissions",
     errno.EPERM: "it is not allowed; choose another place or change its permissions",
     errno.EROFS: "the disk is read-only; choose another place",
@@ -33,7 +34,10 @@ _ADVICE = {
     errno.ENOENT: "the folder it should lie in does not exist; make that first or correct the path",
     errno.ENOTEMPTY: "another program is filling that folder; choose another name",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+    errno.ELOOP: "its links lead in a circle; correct them",
+    errno.EMFILE: "too many files are open; raise the limit (ulimit -n)",
 }
+"""What the system says when it refuses a file, and what to do."""
 
 
 _ONLY_WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
@@ -59,9 +63,9 @@ def plain_errors(path: Path | str, *own: Path) -> Generator[None, None, None]:
             about = Path(os.fsdecode(error.filename)).absolute()
             roots = [p.absolute() for p in own or (Path(path),)]
             ours = ours or any(about == p or p in about.parents or about in p.parents for p in roots)
-        if not ours or error.errno not in _ADVICE:
+        if not ours or error.errno not in ADVICE:
             raise
-        raise TwofoldError(f"Cannot write {path}: {_ADVICE[error.errno]}.") from error
+        raise TwofoldError(f"Cannot write {shown_path(path)}: {ADVICE[error.errno]}.") from error
 
 
 @contextlib.contextmanager
@@ -137,6 +141,45 @@ def write_bytes(path: Path | str, data: bytes) -> None:
     """
     with write_atomically(path) as temporary:
         temporary.write_bytes(data)
+
+
+def write_together(folder: Path | str, contents: Mapping[str, bytes]) -> None:
+    """Writes several files of a folder, all of them or none; the folder is made where it is missing.
+
+    Args:
+        folder: where to.
+        contents: of each file, by name.
+
+    Raises:
+        TwofoldError: see `plain_errors`; files that lay there stay as they were.
+    """
+    folder = Path(folder)
+    with made_folder(folder), contextlib.ExitStack() as stack:
+        for name, content in contents.items():
+            beside = stack.enter_context(write_atomically(folder / name))
+            beside.write_bytes(content)
+            _flush_to_disk(beside)
+
+
+@contextlib.contextmanager
+def made_folder(path: Path | str) -> Generator[None, None, None]:
+    """A folder to write to, made where it is missing; if the block fails, what was made and stayed empty goes again.
+
+    Raises:
+        TwofoldError: see `plain_errors`.
+    """
+    target = Path(path).absolute()
+    missing = [folder for folder in (target, *target.parents) if not os.path.exists(folder)]
+    with plain_errors(path, target):
+        target.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        within = [Path(folder) for folder, _, _ in os.walk(target, topdown=False)] if missing else []
+        for folder in [*within, *missing]:
+            with contextlib.suppress(OSError):  # it holds something
+                folder.rmdir()
+        raise
 
 
 def write_json(path: Path | str, value: object) -> None:

@@ -1,6 +1,7 @@
 """The report and the numbers of a check: `index.html`, which needs nothing else, and `check.json`."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +21,7 @@ from twofold.check.measure import Facts
 from twofold.check.motion_measures import LIMBS, STILL, sides_seen
 from twofold.check.rules import SEEN
 from twofold.errors import TwofoldError
-from twofold.files import plain_errors, write_bytes, write_json
+from twofold.files import json_text, write_together
 from twofold.html.charts import SERIES, Bar, Curve, bars_svg, directions_svg, dots_svg
 from twofold.html.page import KeyMetric, Table, embedded_image, render
 
@@ -58,10 +59,8 @@ def write_check(facts: Facts, capture: Capture, judgement: Judgement, folder: Pa
     """
     folder = Path(folder)
     require_no_file(folder)
-    with plain_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / NUMBERS, numbers(facts, judgement))
-    write_bytes(folder / REPORT, _page(facts, capture, judgement))
+    measured = (json_text(numbers(facts, judgement)) + "\n").encode(errors="replace")
+    write_together(folder, {NUMBERS: measured, REPORT: _page(facts, capture, judgement)})
     return folder / REPORT
 
 
@@ -111,7 +110,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, frozenset):
         return sorted(value)
     if isinstance(value, float):
-        return round(value, 5)
+        return round(value, 5) if math.isfinite(value) else None  # which JSON cannot hold
     return str(value) if isinstance(value, Path) else value
 
 

@@ -151,6 +151,7 @@ def render(
         motion_video: A video of a motion; the others need --motion.
     """
     from twofold.capture.folder import read_capture
+    from twofold.files import made_folder
     from twofold.outputs.gallery import render_run
     from twofold.training.run import choose_device, find_capture, load, require_same
 
@@ -164,7 +165,7 @@ def render(
     read = read_capture(find_capture(run, capture))
     require_same(run, read, motion=False)
     folder = out or run / "renders"
-    with bar("Drawing") as show:
+    with made_folder(folder), bar("Drawing") as show:
         render_run(avatar, read, folder, what, size, chunk, lambda done: show(done, ""))
     say(f"The pictures are in {folder}.", _with_capture(["twofold", "evaluate", str(run)], capture))
 
@@ -301,6 +302,12 @@ def _run(words: list[str]) -> None:
         command()
     except TwofoldError as error:
         print(f"twofold{'' if ALONE else ', process ' + os.environ['RANK']}: {error}", file=sys.stderr)
+        sys.exit(2)
+    except Exception as error:  # the last net
+        from twofold.cli.faults import explain
+
+        given = sys.argv[1:] if arguments is None else arguments
+        print(f"twofold{'' if ALONE else ', process ' + os.environ['RANK']}: {explain(error, given)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
         if ALONE:

@@ -4,7 +4,6 @@ Its weights are two files that others have published and that do not come with t
 """
 
 import os
-import pickle
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from twofold.errors import TwofoldError
+from twofold.inputs import require_file
 
 VGG_FILE = "vgg16-397923af.pth"
 """torchvision's VGG16, trained on ImageNet."""
@@ -126,6 +126,7 @@ def load_lpips(folder: Path | None = None) -> LPIPS | None:
 
 
 _PARTS = ("weight", "bias")
+_MAX_BYTES = 2 * 2**30
 
 
 def _convolutions(block: nn.Module) -> Iterable[nn.Conv2d]:
@@ -146,10 +147,13 @@ def _torchvision_names() -> list[str]:
 
 def _fill(file: Path, wanted: dict[str, Tensor], what: str) -> None:
     """Copies a file's tensors into parameters, by name."""
+    require_file(file, _MAX_BYTES)
     try:
         # Others publish these files in this format; weights_only reads tensors and runs no code.
         stored = torch.load(file, map_location="cpu", weights_only=True)  # noqa: TID251
-    except (OSError, EOFError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # a damaged archive may fail in any way
         raise TwofoldError(f"{file} cannot be read as {what}; download it again.") from error
     for name, parameter in wanted.items():
         found = stored.get(name) if isinstance(stored, dict) else None

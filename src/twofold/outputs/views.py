@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.skeleton import canonical_pose
+from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera, Rays, clip_to_box, pixel_grid, pixel_rays
 from twofold.methods.base import Avatar, PosedAvatar, Rendering
 
@@ -74,6 +75,11 @@ def draw(
         columns = [whole.color, whole.opacity[:, None], whole.depth[:, None], whole.normal, base.color, base.normal]
         out[part] = torch.cat(columns, -1)
     image = out.unflatten(0, (camera.height, camera.width)).cpu()
+    if not image.isfinite().all():
+        raise TwofoldError(
+            "The avatar has colours or depths that are not finite, as after a training that diverged; train again with "
+            "lower learning rates."
+        )
     color, opacity, depth, normal, bottom, bottom_normal = image.split([3, 1, 1, 3, 3, 3], -1)
     return Picture(color.clamp(0, 1), opacity[..., 0], depth[..., 0], normal, bottom.clamp(0, 1), bottom_normal)
 

@@ -16,6 +16,7 @@ from av.video.stream import VideoStream
 from jaxtyping import Shaped, UInt8
 
 from twofold.errors import TwofoldError
+from twofold.inputs import is_there, require_file, shown_path
 
 _LONGEST_GAP = 5.0  # Seconds; what is longer is a fault of the file's clock, not a pause.
 _USUAL_RATE = Fraction(25)
@@ -183,8 +184,9 @@ class Converter:
 @contextlib.contextmanager
 def _opened(path: Path) -> Generator[tuple[InputContainer, VideoStream]]:
     """The file and its first real video stream."""
-    if not path.exists():
-        raise TwofoldError(f"{path} does not exist; correct the path.")
+    if not is_there(path):
+        raise TwofoldError(f"{shown_path(path)} does not exist; correct the path.")
+    require_file(path)
     unknown = TwofoldError(
         f"{path} cannot be read as a video (damaged, cut off, or of another kind); export it again, as MP4 say."
     )
