@@ -4,8 +4,6 @@ import codecs
 import io
 import os
 import pickle
-import time
-import tracemalloc
 import zipfile
 
 import numpy as np
@@ -14,97 +12,13 @@ import scipy.sparse
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from smpl_files import chumpy, model, pickled_by_python2, selected, sparse, stand_in, write
 
-from twofold.body.skeleton import PARENTS, pose_body, shape_body
+from twofold.body.skeleton import pose_body, shape_body
 from twofold.body.smpl import read_smpl
 from twofold.errors import TwofoldError
 
 IGNORED = {"bs_style": "lbs", "bs_type": "lrotmin", "pose_training_info": {"gender": "f", "counts": [1, 2]}}
-
-
-def model(v=60, shapes=10, joints=24, seed=0):
-    """The arrays of a SMPL file with the types they have in it, all numbers random."""
-    random = np.random.default_rng(seed)
-    regressor = np.zeros((joints, v))
-    for row in regressor:
-        row[random.choice(v, 7, replace=False)] = random.dirichlet(np.ones(7))
-    parents = np.array([PARENTS, range(24)]) if joints == 24 else np.zeros((2, joints))
-    columns = 9 * (joints - 1)
-    return {
-        "v_template": random.normal(size=(v, 3)) * 0.3,
-        "shapedirs": random.normal(size=(v, 3, shapes)) * 0.03,
-        "posedirs": random.normal(size=(v, 3, columns)) * 0.003,
-        "J_regressor": regressor,
-        "weights": random.dirichlet(np.full(joints, 0.1), v),
-        "kintree_table": np.where(parents < 0, 2**32 - 1, parents).astype(np.uint32),
-        "f": random.integers(0, v, (2 * v - 4, 3)).astype(np.uint32),
-    }
-
-
-def stand_in(where, **state):
-    """An object that claims to come from a package that is not installed."""
-    module, _, name = where.rpartition(".")
-    made = type(name, (), {"__module__": module, "__qualname__": name})()
-    made.__dict__.update(state)
-    return made
-
-
-def chumpy(array):
-    return stand_in("chumpy.ch.Ch", x=array, _dirty_vars=set(), _depends_on_deps=None)
-
-
-def selected(array):
-    """chumpy's way to write array[...] : the numbers of another object, and which of them."""
-    order = np.random.default_rng(1).permutation(array.size)
-    spread = np.empty(array.size)
-    spread[order] = array.ravel()
-    return stand_in("chumpy.reordering.Select", a=chumpy(spread), idxs=order, preferred_shape=array.shape)
-
-
-def sparse(array, where="scipy.sparse.csc.csc_matrix", shape_name="_shape"):
-    matrix = (scipy.sparse.csc_matrix if "csc" in where else scipy.sparse.csr_matrix)(array)
-    state = {name: getattr(matrix, name) for name in ("data", "indices", "indptr")}
-    return stand_in(where, maxprint=50, **state, **{shape_name: matrix.shape})
-
-
-OLD_NAMES = {"numpy._core.multiarray": "numpy.core.multiarray", "builtins": "__builtin__", "copyreg": "copy_reg"}
-
-
-class Python2Pickler(pickle._Pickler):
-    """Writes what Python 2 wrote: byte strings without a detour, old module names."""
-
-    dispatch = dict(pickle._Pickler.dispatch)  # noqa: RUF012
-
-    def save_bytes(self, data):
-        if self.proto == 0:
-            self.write(b"S" + repr(data)[1:].encode() + b"\n")
-        else:
-            self.write(b"T" + len(data).to_bytes(4, "little") + data)
-
-    dispatch[bytes] = save_bytes
-    dispatch[str] = lambda self, text: self.save_bytes(text.encode("latin1"))
-
-    def save_global(self, obj, name=None):
-        module = OLD_NAMES.get(obj.__module__, obj.__module__)
-        self.write(f"c{module}\n{name or obj.__qualname__}\n".encode())
-        self.memoize(obj)
-
-    def save_type(self, obj):
-        self.save_global(obj)
-
-    dispatch[type] = save_type
-    dispatch[type(stand_in)] = save_global
-
-
-def pickled_by_python2(content, protocol):
-    file = io.BytesIO()
-    Python2Pickler(file, protocol).dump(content)
-    return file.getvalue()
-
-
-def write(path, content):
-    path.write_bytes(content)
-    return path
 
 
 def same_as_the_arrays(body, arrays, shapes=10):
@@ -383,72 +297,3 @@ def test_no_bytes_whatever_do_more_than_be_refused(tmp_path_factory, raw, start)
     path = tmp_path_factory.getbasetemp() / "any.pkl"
     with pytest.raises(TwofoldError):
         read_smpl(write(path, start + raw))
-
-
-def limited(seconds=2, mebibytes=300):
-    """Runs a block that takes little time and memory."""
-    return Limited(seconds, mebibytes * 2**20)
-
-
-class Limited:
-    def __init__(self, seconds, size):
-        self.seconds, self.size = seconds, size
-
-    def __enter__(self):
-        self.begun = time.process_time()
-        tracemalloc.start()
-
-    def __exit__(self, *error):
-        most = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert time.process_time() - self.begun < self.seconds
-        assert most < self.size
-
-
-BOMBS = {
-    "a memo of four thousand million places": b"\x80\x02}r\xff\xff\xff\xf0.",
-    "a memo with holes": b"\x80\x02}q\x00}r\x00\x00\x00\x10.",
-    "a memo in text": b"(dp4000000000\n.",
-    "a million objects": b"\x80\x02(" + b"}" * 1_000_100 + b"l.",
-    "a million classes": b"\x80\x02(" + b"".join(b"cchumpy.ch\nC%d\n" % i for i in range(20_000)) + b"l.",
-    "a string that is not there": b"\x80\x04\x8e" + (2**40).to_bytes(8, "little") + b"abc.",
-    "an array of bytes that is not there": b"\x80\x05\x96" + (2**33).to_bytes(8, "little") + b"abc.",
-    "a frame that is not there": b"\x80\x04\x95" + (2**60).to_bytes(8, "little") + b"}.",
-    "deep lists": b"\x80\x02" + b"]" * 200_000 + b"a" * 199_999 + b".",
-    "a long number": b"L" + b"9" * 100_000 + b"L\n.",
-}
-
-
-@pytest.mark.parametrize("name", BOMBS)
-def test_a_pickle_that_asks_for_endless_memory_is_refused(tmp_path, name):
-    path = write(tmp_path / "smpl.pkl", BOMBS[name])
-    with limited(seconds=30), pytest.raises(TwofoldError):
-        read_smpl(path)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"indptr": np.array([0] * 60 + [2**31])},  # one column repeated two thousand million times
-        {"indptr": np.array([0, 2**40] + [0] * 59)},
-        {"indptr": np.zeros(0, int)},
-        {"indptr": np.arange(10**6)},
-        {"_shape": (2**20, 2**20)},
-        {"_shape": (-24, -60)},
-        {"indices": np.full(3, -1)},
-        {"data": np.ones(1)},
-    ],
-)
-def test_a_sparse_matrix_that_asks_for_endless_memory_is_refused(tmp_path, wrong):
-    bad = sparse(model()["J_regressor"])
-    bad.__dict__.update(wrong)
-    raw = pickled_by_python2(model() | {"J_regressor": bad}, 2)
-    with limited(), pytest.raises(TwofoldError, match=r"J_regressor in .* cannot be read"):
-        read_smpl(write(tmp_path / "smpl.pkl", raw))
-
-
-def test_a_chain_of_chumpy_objects_without_end_is_refused(tmp_path):
-    endless = stand_in("chumpy.ch.Ch")
-    endless.x = endless
-    with pytest.raises(TwofoldError, match=r"weights in .* cannot be read"):
-        read_smpl(write(tmp_path / "smpl.pkl", pickled_by_python2(model() | {"weights": endless}, 2)))

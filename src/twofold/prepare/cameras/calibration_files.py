@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from twofold.capture.layout import MAX_SIDE, intrinsics_faults, rigid_faults
 from twofold.errors import TwofoldError
-from twofold.inputs import read_json, read_text, read_toml
+from twofold.inputs import read_json, read_text, read_toml, shown_path
 from twofold.npz import are_moderate
 from twofold.prepare.cameras.calibration import CalibratedCamera
 
@@ -24,6 +24,7 @@ KNOWN = (
     "Qualisys .qca.txt, EasyMocap or OpenCV intri.yml with extri.yml, Pose2Sim Calib.toml, "
     'or JSON with "cameras" as in capture.json'
 )
+_MAX_NAME = 100
 _QUALISYS = 64
 """Qualisys counts 64 steps to a pixel."""
 
@@ -124,7 +125,7 @@ def _read_qualisys(path: Path) -> dict[str, CalibratedCamera]:
     for entry in root.iter("camera"):
         if entry.get("active", "1") == "0":
             continue
-        name = entry.get("serial", "")
+        name = shown_path(entry.get("serial", ""), _MAX_NAME)
         m = _attributes(path, name, entry, "transform", [f"r{i}{j}" for i in "123" for j in "123"]).reshape(3, 3)
         center = _attributes(path, name, entry, "transform", list("xyz")) / 1000
         keys = ["focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "skew"]
@@ -160,9 +161,9 @@ def _read_opencv(path: Path) -> dict[str, CalibratedCamera]:
     files = [_sibling(folder, stem) for stem in ("intri", "extri")]
     values = parse_opencv(_text(files[0])) | parse_opencv(_text(files[1]))
     listed = values.get("names")
-    names = [key[2:] for key in values if key.startswith("K_")]
+    names = [key[2:] for key in values if key.startswith("K_") and len(key) <= _MAX_NAME]
     if isinstance(listed, list):
-        names = [str(name) for name in listed]
+        names = [shown_path(name, _MAX_NAME) for name in listed]
     cameras: dict[str, CalibratedCamera] = {}
     for name in names:
         place = str(folder)
@@ -253,7 +254,7 @@ def _read_toml(path: Path) -> dict[str, CalibratedCamera]:
     for key, table in tables.items():
         if not isinstance(table, dict) or "matrix" not in table:
             continue
-        name = str(table.get("name", key))
+        name = shown_path(str(table.get("name", key)), _MAX_NAME)
         if table.get("fisheye"):
             raise TwofoldError(f"{path}: camera {name} is a fisheye lens; undistort its video first.")
         turn, translation, size = (_numbers(table.get(k)) for k in ("rotation", "translation", "size"))
@@ -273,7 +274,8 @@ def _read_json(path: Path) -> dict[str, CalibratedCamera]:
     if not isinstance(entries, dict):
         raise TwofoldError(f'{path} should hold "cameras" by name, as capture.json does; add them.')
     cameras: dict[str, CalibratedCamera] = {}
-    for name, entry in entries.items():
+    for key, entry in entries.items():
+        name = shown_path(key, _MAX_NAME)
         given = entry if isinstance(entry, dict) else {}
         height, width = (given.get(key) if type(given.get(key)) is int else None for key in ("height", "width"))
         distortion = given.get("distortion", [0.0] * 5)

@@ -36,6 +36,8 @@ COCO-WholeBody; those without a name are not used."""
 _MAX_BYTES = 256 * 2**20
 """Of a JSON file: 133 landmarks in 30,000 pictures."""
 _MAX_NAME = 255
+_FARTHEST = 1e9
+"""Pixels; what lies beyond was not found."""
 NEEDED = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 
 
@@ -179,7 +181,11 @@ def _layout(count: int, path: Path) -> tuple[str, ...]:
 def _numbers(value: Any) -> np.ndarray | None:
     """An array of numbers, null as NaN; None if it is none."""
     try:
-        return np.array(value, np.float64)
+        given = np.asarray(value)
+        if given.dtype.kind == "c":
+            return None
+        numbers = given.astype(np.float64)
+        return np.where(np.abs(numbers) <= _FARTHEST, numbers, np.nan)  # NaN, of nothing that was found, stays
     except (TypeError, ValueError, OverflowError):
         return None
 
