@@ -140,40 +140,38 @@ def _page(
 ) -> Path:
     by_name = {path.stem if path.suffix == ".png" else path.name: path for path in pictures}
     steps, values = [step for step, _ in curve], [value for _, value in curve]
-    shown = (
-        "Truth, the avatar, and what it is made of: the pose-independent base, what the pose adds, normals, opacity."
-    )
+    shown = "Ground truth, the avatar, its pose-independent base, the pose-dependent residual, normals, opacity."
     sections = [
         Section(
-            "Seen from where no camera stood",
-            f"One camera trained the avatar. These are moments of its motion, seen by the other three. {shown}",
+            "Novel views",
+            f"The avatar was trained on one camera. These are frames of the same motion, seen by the other three. {shown}",
             (Row((CaptionedImage(by_name["novel_view"]),)),),
         ),
         Section(
-            "In poses it never saw",
-            f"Another motion of the same person, from the same unseen cameras. {shown}",
+            "Novel poses",
+            f"Another motion of the same subject, seen by the same held-out cameras. {shown}",
             (
                 Row((CaptionedImage(by_name["novel_pose"]),)),
-                Video("pictures/novel_pose.mp4", "Full avatar and its base."),
+                Video("pictures/novel_pose.mp4", "The avatar and its base."),
             ),
         ),
         Section(
             "The canonical avatar",
-            "All frames are explained by one person in one pose; the low-frequency branch holds what is the same in "
-            "all of them, the high-frequency branch what comes and goes with the pose.",
-            (Row((CaptionedImage(by_name["canonical"]),)), Video("pictures/orbit.mp4", "All around.")),
+            "All frames share one canonical space; the low-frequency branch holds what is the same in all of them, the "
+            "high-frequency branch what changes with the pose.",
+            (Row((CaptionedImage(by_name["canonical"]),)), Video("pictures/orbit.mp4", "Orbit.")),
         ),
-        Section("Training", "", (Chart("PSNR over each step's rays, dB", (Curve("PSNR", steps, values),)),)),
-        Section("Every figure, and how it was measured", "", (metrics_table(with_protocols(metrics)),)),
+        Section("Training", "", (Chart("PSNR of each step's rays, dB", (Curve("PSNR", steps, values),)),)),
+        Section("All metrics, and how they were measured", "", (metrics_table(with_protocols(metrics)),)),
         Section(
-            "Go on",
+            "Next",
             "",
             (
                 Commands(
                     (
-                        (f"twofold render {out / 'run'}", "more pictures of this avatar"),
-                        ("twofold studio mine --seed 7", "film somebody else"),
-                        ("twofold train mine", "and train on that"),
+                        (f"twofold render {out / 'run'}", "more images of this avatar"),
+                        ("twofold studio mine --seed 7", "record another synthetic subject"),
+                        ("twofold train mine", "train on it"),
                     )
                 ),
             ),
@@ -189,7 +187,7 @@ def _page(
         out,
         "An animatable avatar from one camera",
         sections,
-        f"Studio person {seed}: {FRAMES * 4 // 5} training pictures of {SIZE} x {SIZE}, recipe quick.",
+        f"Synthetic subject {seed}: {FRAMES * 4 // 5} training images of {SIZE} x {SIZE}, recipe quick.",
         key_metrics,
         Video("pictures/orbit.mp4"),
     )

@@ -81,7 +81,7 @@ def curves_svg(chart: Chart) -> str:
     curves = [_finite(curve, chart.logarithmic) for curve in chart.curves]
     if not any(len(points) for points in curves):
         return "<p>Nothing was recorded.</p>"
-    with _axes(480, 260, (54, 26, 10, 40)) as (figure, axes):
+    with _axes(480, 260, (64, 26, 10, 40)) as (figure, axes):
         if chart.logarithmic:
             axes.set_yscale("log")
         for i, points in enumerate(curves):
