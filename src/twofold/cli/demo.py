@@ -144,7 +144,7 @@ def _page(
     sections = [
         Section(
             "Novel views",
-            f"The avatar was trained on one camera. These are frames of the same motion, seen by the other three. {shown}",
+            f"One camera trained the avatar. These are frames of the same motion, seen by the other three. {shown}",
             (Row((CaptionedImage(by_name["novel_view"]),)),),
         ),
         Section(
