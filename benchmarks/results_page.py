@@ -1,0 +1,179 @@
+"""`docs/results.md` and the table of the README, made from the JSON files in `benchmarks/results/`.
+
+Run `python -m benchmarks.results_page` after a benchmark; a test holds both pages to the stored numbers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS, PAGE, README = ROOT / "benchmarks" / "results", ROOT / "docs" / "results.md", ROOT / "README.md"
+BEGIN, END = "<!-- results -->\n", "<!-- /results -->\n"
+"""The lines of the README between which its table stands."""
+
+PICTURES = """## Images of real people
+
+![A man who juggles a football](pictures/real_juggle.jpg)
+
+*Straight from a video of ten seconds, one static camera: held-out frames beside the ground truth, an orbit (the back
+is an unobserved region), a novel pose. Images: demo gallery of SAM 2, Meta Platforms (Apache-2.0).*
+
+![The balancing man before and after pose refinement](pictures/real_refined.jpg)
+
+*Pose refinement: a held-out frame, the avatar in its pose as given and as corrected, twice. Green: outline of the
+ground truth mask.*
+
+![A man filmed by four cameras](pictures/real_four.jpg)
+
+*Trained on the first camera. Above: the second, third and fourth camera beside the avatar, the lower row in held-out
+frames. Then an orbit and a novel pose.*
+
+![The balancing man from prepared poses and masks](pictures/real_p2s.jpg)
+
+![The juggler from prepared poses and masks](pictures/real_sam2.jpg)
+
+*From poses and masks prepared elsewhere. Images of the balancing man: demo data of Pose2Sim (BSD-3-Clause), credited to
+@aaiaueil, Université Gustave Eiffel; of the juggler: demo gallery of SAM 2, Meta Platforms (Apache-2.0).*
+"""
+
+
+def load(folder: Path = RESULTS) -> dict[str, Any]:
+    """Every stored result by its file's name."""
+    return {file.stem: json.loads(file.read_text("utf-8")) for file in sorted(folder.glob("*.json"))}
+
+
+def results_page(results: dict[str, Any]) -> str:
+    """The page, Markdown."""
+    machines = "; ".join(sorted(set(map(_machine, _benchmarks(results)))))
+    parts = [
+        "# Results\n\nMade from the JSON files in `benchmarks/results/` by `python -m benchmarks.results_page`. All "
+        f"numbers are from CPUs: {machines}.\n",
+        f"## Avatars and fits\n\n{_captures(results['captures'])}",
+        "## Training step\n\nSame networks, rays and losses. `fast` has the paper's network sizes, the shell sampler, "
+        "a hand-written reverse pass and bfloat16 hidden layers; the reference form is the usual one: error-bounded "
+        "sampler, autograd through autograd, dense samples, float32. `python -m benchmarks.step`.\n\n"
+        + _steps(_named(results, "step-")),
+        "## Rendering\n\nSeconds for one image, posing included. `python -m benchmarks.rendering`.\n\n"
+        + _rendering(_named(results, "rendering-")),
+        "## Quality against time\n\nSynthetic subject, one training camera; PSNR over the subject's box. "
+        "`python -m benchmarks.quality`.\n\n" + _quality(_named(results, "quality-")),
+        PICTURES,
+    ]
+    return "\n".join(part.rstrip() + "\n" for part in parts)
+
+
+def readme_table(results: dict[str, Any]) -> str:
+    """The five rows of the README, Markdown."""
+    one, two = results["step-cpu-1threads"], results["step-cpu-2threads"]
+    picture, picture_one = results["rendering-cpu-2threads"], results["rendering-cpu-1threads"]
+    rows = {row["subject"]: row["result"] for row in results["captures"]["rows"]}
+    return _table(
+        ("What", "Result"),
+        [
+            ("Synthetic subject, 40 images from one camera, novel views / poses", rows["Synthetic subject, seed 0"]),
+            ("Avatar from a raw video of a man who juggles", rows["The same video: avatar"]),
+            (
+                "Avatar from a video with poses and masks prepared elsewhere",
+                rows["The balancing man, poses and masks prepared elsewhere"],
+            ),
+            (
+                "Training step, the paper's network sizes, 1,728 rays",
+                f"{_s(two['fast'])}, {_ratio(two):.0f} times faster than the reference form ({_s(two['reference'])}); "
+                f"on one core {_s(one['fast'])}, {_ratio(one):.0f} times",
+            ),
+            (
+                "Image of 512 x 512",
+                f"recipe `quick` {_s(picture['quick']['512'])}, the paper's networks {_s(picture['fast']['512'])}; "
+                f"on one core {_s(picture_one['quick']['512'])} and {_s(picture_one['fast']['512'])}",
+            ),
+        ],
+    )
+
+
+def readme_with(text: str, table: str) -> str:
+    """The README with `table` between its marks."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return f"{before}{BEGIN}{table}{END}{after}"
+
+
+def main() -> None:
+    """Writes both pages."""
+    argparse.ArgumentParser(prog="python -m benchmarks.results_page", description=__doc__).parse_args()
+    results = load()
+    PAGE.write_text(results_page(results), "utf-8")
+    README.write_text(readme_with(README.read_text("utf-8"), readme_table(results)), "utf-8")
+
+
+def _named(results: dict[str, Any], prefix: str) -> dict[str, Any]:
+    return {name: result for name, result in results.items() if name.startswith(prefix) and "cpu" in name}
+
+
+def _benchmarks(results: dict[str, Any]) -> list[dict[str, Any]]:
+    return [result for prefix in ("step-", "rendering-", "quality-") for result in _named(results, prefix).values()]
+
+
+def _machine(result: dict[str, Any]) -> str:
+    machine = result["machine"]
+    extra = " with AVX-512" if machine["avx512"] else ""
+    return f"{machine['processor']}, {machine['cores']} cores{extra}, torch {machine['torch']}"
+
+
+def _captures(captures: dict[str, Any]) -> str:
+    rows = [(row["subject"], row["result"], f"`{row['command']}`: {row['how']}") for row in captures["rows"]]
+    return _table(("What", "Result", "How"), rows)
+
+
+def _steps(results: dict[str, Any]) -> str:
+    rows = [
+        (
+            str(result["threads"]), f"`{name}`" if name != "reference" else "reference form", _s(part),
+            f"{part['rays_per_s']:,.0f}", f"{part['samples_per_ray']:.1f}", f"{part['peak_memory_gb']:.1f} GB",
+            f"{result['reference']['median_s'] / part['median_s']:.0f}" if name == "fast" else "",
+        )
+        for result in results.values() for name in ("quick", "fast", "reference") for part in [result[name]]
+    ]  # fmt: skip
+    return _table(("Threads", "Form", "Step", "Rays per second", "Samples per ray", "Memory", "Times faster"), rows)
+
+
+def _rendering(results: dict[str, Any]) -> str:
+    rows = [
+        (str(result["threads"]), f"`{name}`" if name != "reference" else "reference form", f"{size} x {size}", _s(part))
+        for result in results.values() for name in ("quick", "fast", "reference") for size, part in result[name].items()
+    ]  # fmt: skip
+    return _table(("Threads", "Form", "Image", "Time"), rows)
+
+
+def _quality(results: dict[str, Any]) -> str:
+    rows = [
+        (
+            str(result["threads"]), str(result["seed"]), str(point["step"]), f"{point['seconds']:.0f} s",
+            f"{point['novel_view']:.1f} dB", f"{point['novel_pose']:.1f} dB",
+        )
+        for result in results.values() for point in result["curve"]
+    ]  # fmt: skip
+    return _table(("Threads", "Seed", "Step", "Training time", "Novel views", "Novel poses"), rows)
+
+
+def _ratio(result: dict[str, Any]) -> float:
+    return result["reference"]["median_s"] / result["fast"]["median_s"]
+
+
+def _s(part: dict[str, Any]) -> str:
+    """A median in seconds with two or three digits."""
+    seconds = part["median_s"]
+    return f"{seconds:.{0 if seconds >= 10 else 1 if seconds >= 3 else 2}f} s"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |\n" for line in lines)
+
+
+if __name__ == "__main__":
+    main()
