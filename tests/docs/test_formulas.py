@@ -10,9 +10,8 @@ SPACE = "{http://www.w3.org/1998/Math/MathML}"
 
 
 def built(text: str) -> str:
-    page = markdown.markdown(
-        text, extensions=["pymdownx.arithmatex"], extension_configs={"pymdownx.arithmatex": {"generic": True}}
-    )
+    name = "pymdownx.arithmatex"
+    page = markdown.markdown(text, extensions=[name], extension_configs={name: {"generic": True}})
     return formulas.on_page_content(page)
 
 
