@@ -4,8 +4,22 @@ import pytest
 import torch
 from small_cloud import JOINTS_64, posed_cloud, random_pose, small_cloud
 
-from twofold.field.bone_boxes import RIGID_PARTS, TWO_HOPS, bone_frames, initial_half_sizes
-from twofold.field.points import PointCloud, PointDeformation, farthest_points, nearest_neighbours
+from twofold.errors import TwofoldError
+from twofold.field.bone_boxes import (
+    RIGID_PARTS,
+    TWO_HOPS,
+    assign_to_boxes,
+    bone_frames,
+    box_coordinates,
+    initial_half_sizes,
+)
+from twofold.field.points import (
+    PointCloud,
+    PointDeformation,
+    choose_positions,
+    farthest_points,
+    nearest_neighbours,
+)
 
 
 def test_points_are_chosen_farthest_first(generator):
@@ -20,6 +34,25 @@ def test_points_are_chosen_farthest_first(generator):
 def test_too_few_points_are_refused():
     with pytest.raises(ValueError, match="5 points cannot be chosen from 3"):
         farthest_points(torch.zeros(3, 3), 5)
+
+
+def test_positions_are_the_farthest_points_of_each_part(generator):
+    half_sizes = initial_half_sizes(JOINTS_64)[list(RIGID_PARTS)]
+    frames = bone_frames(JOINTS_64)
+    inside = 1.8 * torch.rand(40, 19, 3, generator=generator, dtype=torch.float64) - 0.9
+    rest = (frames.rotations[list(RIGID_PARTS)].mT @ (inside * half_sizes)[..., None])[..., 0]
+    rest = (rest + frames.origins[list(RIGID_PARTS)]).flatten(0, 1)
+    to_frame = frames.world_to_frame(torch.eye(4, dtype=torch.float64).repeat(24, 1, 1))[list(RIGID_PARTS)]
+    coordinates = box_coordinates(rest, to_frame, half_sizes)
+    part = assign_to_boxes(coordinates, half_sizes)
+    fewest = int(torch.bincount(part[part >= 0], minlength=19).min())
+    positions = choose_positions(coordinates, half_sizes, fewest)
+    for k in range(19):
+        own = coordinates[part == k, k]
+        chosen = own[farthest_points(own * half_sizes[k], fewest)]
+        assert torch.equal(positions[:, k], chosen)
+    with pytest.raises(TwofoldError, match=f"needs {fewest + 1} surface points for each body part, the .* has"):
+        choose_positions(coordinates, half_sizes, fewest + 1)
 
 
 def test_neighbours_are_the_nearest_and_begin_with_the_point_itself(generator):

@@ -12,7 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from twofold.field.bone_boxes import RIGID_PARTS, TWO_HOPS, bone_frames
+from twofold.body.skeleton import JOINT_NAMES
+from twofold.errors import TwofoldError
+from twofold.field.bone_boxes import RIGID_PARTS, TWO_HOPS, assign_to_boxes, bone_frames
 from twofold.field.graph import NodeLinear, PoseGraph
 from twofold.geometry.rotations import rigid_inverse
 
@@ -45,6 +47,35 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "co
         chosen[index] = distances.argmax()
         distances = torch.minimum(distances, (points - points[chosen[index]]).square().sum(-1))
     return chosen
+
+
+def choose_positions(
+    coordinates: Float[Tensor, "n 19 3"], half_sizes: Float[Tensor, "19 3"], count: int = 200
+) -> Float[Tensor, "count 19 3"]:
+    """Box coordinates of `count` surface points for each part, as far from each other as can be.
+
+    Each point belongs to the nearest box that holds it (`assign_to_boxes`); points in no box are left out. The authors'
+    programs choose 1000 of each part first and 200 of these later, which are the same 200.
+
+    Args:
+        coordinates: of points on the surface that DANBO found (rest pose), in the boxes of the rigid parts.
+        half_sizes: of these boxes, metres.
+        count: points of each part.
+
+    Raises:
+        TwofoldError: a part has fewer points.
+    """
+    part = assign_to_boxes(coordinates, half_sizes)
+    columns = []
+    for index, joint in enumerate(RIGID_PARTS):
+        own = coordinates[part == index, index]
+        if len(own) < count:
+            raise TwofoldError(
+                f"NPC needs {count} surface points for each body part, the {JOINT_NAMES[joint]} has {len(own)}; train "
+                "its first stage longer, or on more frames that show this part."
+            )
+        columns.append(own[farthest_points(own * half_sizes[index], count)])
+    return torch.stack(columns, 1)
 
 
 def two_hop_mask() -> Float[Tensor, "19 19"]:
