@@ -20,11 +20,13 @@ from twofold.body.skeleton import JOINT_NAMES, PARENTS
 from twofold.errors import TwofoldError
 from twofold.files import write_bytes
 from twofold.geometry.rotations import axis_angle_to_matrix
-from twofold.inputs import read_bytes
+from twofold.inputs import read_bytes, shown
 
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
 MAX_BYTES = 2**29
 """Of a file: half an hour of fingers and all at 120 frames a second has 400 MB."""
+_LARGEST = 1e7
+"""No angle in degrees and no length in any unit is larger."""
 _ENDS = {10: (0.0, -0.01, 0.07), 11: (0.0, -0.01, 0.07), 15: (0.0, 0.15, 0.0), 22: (0.08, 0.0, 0.0), 23: (-0.08, 0, 0)}
 """How far the last bones reach, metres: a skeleton of joints does not tell."""
 
@@ -99,7 +101,11 @@ def _hierarchy(text: str, path: Path) -> tuple[BvhJoint, ...]:
             joints[open_joints[-1]] = BvhJoint(joint.name, joint.parent, offset, joint.channels)
             i += 4
         elif kind == "channels" and open_joints:
-            count = int(_number(words[i + 1][0], path, line)) if i + 1 < len(words) else 0
+            count = int(_number(words[i + 1][0], path, line)) if i + 1 < len(words) else -1
+            if count not in range(len(CHANNELS) + 1):
+                raise TwofoldError(
+                    f"{path}, line {line}: a joint has 0 to 6 CHANNELS, it says {count}; export it again."
+                )
             joint = joints[open_joints[-1]]
             channels = tuple(_channel(w, path, n) for w, n in words[i + 2 : i + 2 + count])
             joints[open_joints[-1]] = BvhJoint(joint.name, joint.parent, joint.offset, channels)
@@ -110,7 +116,7 @@ def _hierarchy(text: str, path: Path) -> tuple[BvhJoint, ...]:
         else:
             raise TwofoldError(
                 f"{path}, line {line}: expected ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace, it says "
-                f"{word!r}; export the file again."
+                f"{shown(word)}; export the file again."
             )
     if open_joints or not joints:
         raise TwofoldError(f"The HIERARCHY of {path} is not complete: a brace is never closed; export it again.")
@@ -122,8 +128,10 @@ def _number(word: str, path: Path, line: int) -> float:
         value = float(word)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        raise TwofoldError(f"{path}, line {line}: expected a finite number, it says {word!r}; export the file again.")
+    if not abs(value) <= _LARGEST:
+        raise TwofoldError(
+            f"{path}, line {line}: expected a number of at most {_LARGEST:g}, it says {shown(word)}; export it again."
+        )
     return value
 
 
@@ -131,7 +139,7 @@ def _channel(word: str, path: Path, line: int) -> str:
     for channel in CHANNELS:
         if word.lower() == channel.lower():
             return channel
-    raise TwofoldError(f"{path}, line {line}: expected a channel such as Zrotation, it says {word!r}.")
+    raise TwofoldError(f"{path}, line {line}: expected a channel such as Zrotation, it says {shown(word)}.")
 
 
 def _with_frames(joints: tuple[BvhJoint, ...], text: str, path: Path) -> Bvh:
@@ -156,9 +164,12 @@ def _with_frames(joints: tuple[BvhJoint, ...], text: str, path: Path) -> Bvh:
         values = np.array(words, dtype=np.float64)
     except ValueError as error:
         raise TwofoldError(f"MOTION in {path} holds something that is no number ({error}); export it again.") from error
-    if not np.isfinite(values).all():
-        frame = int(np.flatnonzero(~np.isfinite(values))[0]) // columns
-        raise TwofoldError(f"Frame {frame} of {path} holds NaN or infinity; repair or leave out that frame.")
+    wrong = np.flatnonzero(~(np.abs(values) <= _LARGEST))
+    if len(wrong):
+        raise TwofoldError(
+            f"Frame {wrong[0] // columns} of {path} holds {values[wrong[0]]}, at most {_LARGEST:g} is expected; "
+            "repair or leave out that frame."
+        )
     return Bvh(joints, torch.from_numpy(values.reshape(-1, columns)), 1 / seconds)
 
 
