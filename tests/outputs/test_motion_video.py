@@ -27,7 +27,7 @@ CAMERAS = motion_cameras(BODY, MOTION, 48, follow=True)
 WHITE = torch.ones(3)
 
 
-def half_red(pose, translation, camera):
+def half_red(index, camera):
     """Premultiplied half red on the left, nothing on the right."""
     color, opacity = torch.zeros(camera.height, camera.width, 3), torch.zeros(camera.height, camera.width)
     color[:, :24, 0], opacity[:, :24] = 0.5, 0.5
@@ -36,7 +36,7 @@ def half_red(pose, translation, camera):
 
 def test_a_video_shows_every_frame_on_the_background(tmp_path):
     shares = []
-    write_motion(tmp_path / "out" / "walk.mp4", MOTION, CAMERAS, half_red, WHITE, progress=shares.append)
+    write_motion(tmp_path / "out" / "walk.mp4", 2.0, CAMERAS, half_red, WHITE, progress=shares.append)
     with av.open(str(tmp_path / "out" / "walk.mp4")) as file:
         frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
         assert file.streams.video[0].average_rate == 2
@@ -50,7 +50,7 @@ def test_a_video_shows_every_frame_on_the_background(tmp_path):
 @pytest.mark.parametrize("ending", [".webm", ".mov"])
 def test_videos_with_opacity_hold_straight_colours(tmp_path, ending):
     path = tmp_path / f"walk{ending}"
-    write_motion(path, MOTION, CAMERAS, half_red, WHITE, alpha=True)
+    write_motion(path, 2.0, CAMERAS, half_red, WHITE, alpha=True)
     with av.open(str(path)) as file:
         stream = file.streams.video[0]
         if ending == ".webm":  # the decoder that knows VP9's opacity is not the default one
@@ -64,29 +64,29 @@ def test_videos_with_opacity_hold_straight_colours(tmp_path, ending):
 
 def test_images_with_opacity_hold_straight_colours_and_replace_nothing_unasked(tmp_path):
     folder = tmp_path / "images"
-    write_motion(folder, MOTION, CAMERAS, half_red, WHITE, alpha=True)
+    write_motion(folder, 2.0, CAMERAS, half_red, WHITE, alpha=True)
     names = sorted(path.name for path in folder.iterdir())
     assert names == [f"{k:06d}.png" for k in range(len(MOTION))]
     with Image.open(folder / names[0]) as image:
         assert image.getpixel((10, 20)) == (255, 0, 0, 128)
         assert image.getpixel((40, 20))[3] == 0
     with pytest.raises(TwofoldError, match="already holds files"):
-        write_motion(folder, MOTION, CAMERAS, half_red, WHITE, alpha=True)
-    write_motion(folder, MOTION, CAMERAS, half_red, WHITE, alpha=True, replace=True)
+        write_motion(folder, 2.0, CAMERAS, half_red, WHITE, alpha=True)
+    write_motion(folder, 2.0, CAMERAS, half_red, WHITE, alpha=True, replace=True)
 
 
 def test_a_rendering_that_fails_leaves_nothing(tmp_path):
-    def broken(pose, translation, camera):
+    def broken(index, camera):
         raise TwofoldError("broken")
 
     for path in (tmp_path / "a.mp4", tmp_path / "b"):
         with pytest.raises(TwofoldError, match="broken"):
-            write_motion(path, MOTION, CAMERAS, broken, WHITE)
+            write_motion(path, 2.0, CAMERAS, broken, WHITE)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_bare_body_stands_on_its_floor():
-    view = body_renderer(BODY, WHITE)(MOTION.poses[0], MOTION.translations[0], CAMERAS[0])
+    view = body_renderer(BODY, MOTION, WHITE)(0, CAMERAS[0])
     assert 0.05 < float(view.opacity.mean()) < 0.5
     assert view.behind is not None
     assert view.on(WHITE)[0, 0].tolist() == [1, 1, 1]
@@ -98,7 +98,7 @@ def test_an_avatar_is_rendered_as_it_is_posed(trained):
     assert body.vertices.shape == avatar.pose(torch.zeros(24, 3), torch.zeros(3)).body.vertices.shape
     motion = resampled(as_single(BUILTIN_MOTIONS["turn"](body)), 0.5)
     cameras = motion_cameras(body, motion, 24)
-    view = field_renderer(avatar)(motion.poses[1], motion.translations[1], cameras[1])
+    view = field_renderer(avatar, motion)(1, cameras[1])
     assert 0.02 < float(view.opacity.mean()) < 0.7
     assert (view.color <= view.opacity[..., None] + 0.02).all()
 

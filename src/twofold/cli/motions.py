@@ -80,7 +80,8 @@ def motion(
     path = out or Path(f"{moved.name}-preview.mp4")
     cameras = motion_cameras(shaped, moved, size, follow)
     with bar("Rendering") as show:
-        write_motion(path, moved, cameras, body_renderer(shaped, color), color, progress=lambda done: show(done, ""))
+        renderer = body_renderer(shaped, moved, color)
+        write_motion(path, moved.fps, cameras, renderer, color, progress=lambda done: show(done, ""))
     say(f"The preview is {path}.", f"twofold render RUN --motion {source}")
 
 
@@ -112,9 +113,9 @@ def render_motion(run: Path, shown: MotionView, size: int, out: Path | None, chu
     for line in read.lines():
         console().print(line, soft_wrap=True)
     cameras = motion_cameras(body, read.motion, size, shown.follow)
-    renderer = field_renderer(avatar, chunk)
+    renderer = field_renderer(avatar, read.motion, chunk)
     with bar("Rendering") as show:
         write_motion(
-            path, read.motion, cameras, renderer, color, shown.alpha, lambda done: show(done, ""), path == default
+            path, read.motion.fps, cameras, renderer, color, shown.alpha, lambda done: show(done, ""), path == default
         )
     say(f"The motion is in {path}.", f"twofold motion {shown.motion}")

@@ -43,8 +43,8 @@ class View:
         return torch.cat([self.color / opacity.clamp_min(1e-4), opacity], -1).clamp(0, 1)
 
 
-Renderer = Callable[[Float[Tensor, "24 3"], Float[Tensor, "3"], Camera], View]
-"""Makes the view of a pose (axis-angle, and translation) from a camera. A baked mesh is another one of these."""
+Renderer = Callable[[int, Camera], View]
+"""Makes the view of a motion's frame (by its index) from a camera."""
 
 
 @torch.no_grad()
@@ -56,21 +56,22 @@ def rest_body(avatar: Avatar) -> ShapedBody:
     return ShapedBody(vertices, joints, faces, weights, vertices.new_zeros(len(vertices), 3, 0))
 
 
-def field_renderer(avatar: Avatar, chunk: int | None = None) -> Renderer:
+def field_renderer(avatar: Avatar, motion: Motion, chunk: int | None = None) -> Renderer:
     """Renders the avatar's field: the best image, the slowest."""
 
-    def view(pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], camera: Camera) -> View:
-        image = draw(avatar, avatar.pose(pose, translation), camera, torch.zeros(3), chunk)
+    def view(index: int, camera: Camera) -> View:
+        posed = avatar.pose(motion.poses[index], motion.translations[index])
+        image = draw(avatar, posed, camera, torch.zeros(3), chunk)
         return View(image.color, image.opacity)
 
     return view
 
 
-def body_renderer(body: ShapedBody, background: Float[Tensor, "3"], floor: bool = True) -> Renderer:
+def body_renderer(body: ShapedBody, motion: Motion, background: Float[Tensor, "3"], floor: bool = True) -> Renderer:
     """Renders a bare body as clay, on a floor with its shadow."""
 
-    def view(pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], camera: Camera) -> View:
-        vertices = pose_body(body, pose, translation).vertices
+    def view(index: int, camera: Camera) -> View:
+        vertices = pose_body(body, motion.poses[index], motion.translations[index]).vertices
         color, opacity = mesh_image(camera, vertices, body.faces)
         return View(color, opacity, floor_image(camera, background, vertices, body.faces) if floor else None)
 
@@ -117,7 +118,7 @@ def require_video_path(path: Path, alpha: bool) -> None:
 
 def write_motion(
     path: Path,
-    motion: Motion,
+    fps: float,
     cameras: list[Camera],
     renderer: Renderer,
     background: Float[Tensor, "3"],
@@ -129,9 +130,9 @@ def write_motion(
 
     Args:
         path: see `require_video_path`.
-        motion: what is shown.
+        fps: frames per second.
         cameras: one for every frame.
-        renderer: of a pose.
+        renderer: of the motion's frames.
         background: colour behind, 0..1.
         alpha: keep the opacity instead of a background.
         progress: told the share that is done.
@@ -143,7 +144,7 @@ def write_motion(
 
     def views() -> Iterator[UInt8[np.ndarray, "h w c"]]:
         for index, camera in enumerate(cameras):
-            view = renderer(motion.poses[index], motion.translations[index], camera)
+            view = renderer(index, camera)
             image = view.with_alpha() if alpha else view.on(background).clamp(0, 1)
             yield (image * 255).round().to(torch.uint8).numpy()
             progress((index + 1) / len(cameras))
@@ -151,7 +152,7 @@ def write_motion(
     if path.suffix:
         if path.parent != path:
             path.parent.mkdir(parents=True, exist_ok=True)
-        (write_alpha_video if alpha else write_video)(path, views(), motion.fps)
+        (write_alpha_video if alpha else write_video)(path, views(), fps)
         return
     with new_folder(path, replace) as folder:
         for index, image in enumerate(views()):
