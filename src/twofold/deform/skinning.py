@@ -13,7 +13,14 @@ from twofold.kernels.sparse_rows import weighted_rows
 def inverse_skinning(
     x_posed: Float[Tensor, "S 3"], weights: Float[Tensor, "S J"], bones: Float[Tensor, "J 4 4"]
 ) -> Float[Tensor, "S 3"]:
-    """Carries points home: x_c = (sum_i w_i B_i)^-1 x_o (Eq. 1).
+    r"""Moves points into canonical space: the inverse of linear blend skinning (Eq. 1).
+
+    \[ x_c = \Big( \sum_{i=1}^{N_B} \omega_i B_i \Big)^{-1} x_o \]
+
+    >>> bones = torch.eye(4).repeat(2, 1, 1)
+    >>> bones[1, 0, 3] = 2.0  # the second bone stands two metres off
+    >>> inverse_skinning(torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[0.5, 0.5]]), bones)
+    tensor([[0., 0., 0.]])
 
     Args:
         x_posed: points of observation space, metres.
@@ -26,7 +33,17 @@ def inverse_skinning(
 
 
 def invert_affine(rows: Float[Tensor, "*b 3 4"]) -> Float[Tensor, "*b 3 4"]:
-    """Inverse of affine maps given by their upper three rows, by the adjugate (no LAPACK call for each point)."""
+    r"""Inverse of affine maps given by their upper three rows, by the adjugate (no LAPACK call for each point).
+
+    \[ (A \mid t)^{-1} = (A^{-1} \mid -A^{-1} t), \qquad
+    A^{-1} = \frac{1}{a \cdot (b \times c)} \, (b \times c \mid c \times a \mid a \times b)
+    \text{ with the rows } a, b, c \text{ of } A \]
+
+    >>> invert_affine(torch.tensor([[2.0, 0, 0, 1], [0, 4, 0, 2], [0, 0, 1, 3]]))[:, [0, 3]]
+    tensor([[ 0.5000, -0.5000],
+            [ 0.0000, -0.5000],
+            [ 0.0000, -3.0000]])
+    """
     a, b, c = rows[..., 0, :3], rows[..., 1, :3], rows[..., 2, :3]
     bc, ca, ab = torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)
     determinant = (a * bc).sum(-1, keepdim=True)
@@ -35,20 +52,41 @@ def invert_affine(rows: Float[Tensor, "*b 3 4"]) -> Float[Tensor, "*b 3 4"]:
 
 
 def vertex_transforms(body: PosedBody) -> Float[Tensor, "V 3 4"]:
-    """sum_i w_i B_i at each vertex of the body, canonical to posed."""
+    r"""The blended transform of each vertex, $\sum_i w_{vi} B_i$, canonical to posed.
+
+    >>> bones = torch.eye(4).repeat(24, 1, 1)
+    >>> bones[1, 0, 3] = 2.0
+    >>> weights = torch.zeros(1, 24)
+    >>> weights[0, :2] = 0.5
+    >>> point, joints = torch.zeros(1, 3), torch.zeros(24, 3)
+    >>> body = PosedBody(point, point, torch.zeros(0, 3, dtype=torch.long), weights, bones, joints, joints)
+    >>> vertex_transforms(body)[0, :, 3]  # half of the way
+    tensor([1., 0., 0.])
+    """
     return (body.weights @ body.bones[:, :3].flatten(1)).unflatten(-1, (3, 4))
 
 
 def neighbour_weights(squared_distances: Float[Tensor, "S K"]) -> Float[Tensor, "S K"]:
-    """Share of each of the K nearest vertices as Vid2Avatar defines it: exp(-min(d^2, 4)), d in metres, normalised."""
+    r"""Weight of each of the K nearest vertices as Vid2Avatar defines it, for distances in the caller's unit.
+
+    \[ \omega_k = \frac{e^{-\min(d_k^2, 4)}}{\sum_l e^{-\min(d_l^2, 4)}} \]
+
+    >>> neighbour_weights(torch.tensor([[0.0, 0.6931]]))  # e to the minus ln 2 is a half
+    tensor([[0.6667, 0.3333]])
+    """
     return torch.softmax(-squared_distances.clamp_max(4.0), -1)
 
 
 def smooth_neighbour_weights(squared_distances: Float[Tensor, "S K"]) -> Float[Tensor, "S K"]:
-    """Share of each of the K nearest vertices, (1 - d^2 / d_K^2)^2 normalised, so that the last one counts nothing.
+    r"""Weight of each of the K nearest vertices that falls to nothing at the last of them.
 
-    A vertex that comes among the nearest, or leaves them, does so with weight zero, so neighbouring points are carried
-    alike. Points as far from all K take their mean.
+    \[ \omega_k \propto (1 - d_k^2 / d_K^2)^2 + 10^{-6} \]
+
+    A vertex that comes among the nearest, or leaves them, does so with weight zero, so neighbouring points move alike.
+    Points as far from all K take their mean.
+
+    >>> smooth_neighbour_weights(torch.tensor([[0.0, 0.5, 1.0]]))
+    tensor([[8.0000e-01, 2.0000e-01, 8.0000e-07]])
     """
     farthest = squared_distances.amax(-1, keepdim=True)
     raw = (1 - squared_distances / farthest.clamp_min(1e-12)).square() + 1e-6
@@ -58,7 +96,9 @@ def smooth_neighbour_weights(squared_distances: Float[Tensor, "S K"]) -> Float[T
 def weights_by(
     falloff: Literal["exponential", "scene", "smooth"], squared_distances: Float[Tensor, "S K"], scale: float = 1.0
 ) -> Float[Tensor, "S K"]:
-    """`neighbour_weights` of distances in metres ("exponential") or in scene units, or `smooth_neighbour_weights`.
+    r"""`neighbour_weights` of distances in metres ("exponential") or in scene units, or `smooth_neighbour_weights`.
+
+    Scene units multiply distances: $d \to s \, d$ with the scale $s$.
 
     >>> weights_by("scene", torch.tensor([[0.0, 0.01]]), scale=10.0)  # 1 m is 10 units, so 10 cm are one
     tensor([[0.7311, 0.2689]])
@@ -79,7 +119,16 @@ def to_canonical(
     shares: Float[Tensor, "S K"],
     forward: Float[Tensor, "V 3 4"],
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 3"]]:
-    """`inverse_skinning` with the weights of the nearest vertices, and the matrix for normals.
+    r"""`inverse_skinning` with the weights of the nearest vertices, and the matrix for normals.
+
+    \[ x_c = \Big( \sum_k \omega_k F_{v_k} \Big)^{-1} x_o, \qquad \nabla_{x_o} s = J^{-\top} \nabla_{x_c} s \]
+
+    with the transforms $F_v$ of the vertices and the linear part $J$ of their blend.
+
+    >>> forward = torch.tensor([[[2.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]]])  # doubles x, then adds 1
+    >>> x_c, turn = to_canonical(torch.tensor([[5.0, 0.0, 0.0]]), torch.tensor([[0]]), torch.ones(1, 1), forward)
+    >>> x_c, turn[0].diagonal()
+    (tensor([[2., 0., 0.]]), tensor([0.5000, 1.0000, 1.0000]))
 
     Blending vertices' weights is blending their transforms, so the K rows are mixed and inverted once. With one
     neighbour the transforms are inverted at the vertices instead, of which there are fewer than samples. Which vertices
@@ -103,7 +152,14 @@ def to_canonical(
 def normal_matrices(
     nearest: Int[Tensor, "S K"], shares: Float[Tensor, "S K"], forward: Float[Tensor, "V 3 4"]
 ) -> Float[Tensor, "S 3 3"]:
-    """J^-T of `to_posed`: a canonical gradient times it is the gradient in observation space.
+    r"""$J^{-\top}$ of `to_posed`: a canonical gradient times it is the gradient in observation space.
+
+    \[ J = \Big[ \sum_k \omega_k F_{v_k} \Big]_{3 \times 3}, \qquad
+    n = \frac{J^{-\top} \nabla_{x_c} s}{\lVert J^{-\top} \nabla_{x_c} s \rVert} \]
+
+    >>> forward = torch.tensor([[[2.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]]])
+    >>> normal_matrices(torch.tensor([[0]]), torch.ones(1, 1), forward)[0].diagonal()
+    tensor([0.5000, 1.0000, 1.0000])
 
     Args:
         nearest: the K nearest canonical vertices of canonical points. The release takes normals by these, though the
@@ -127,6 +183,20 @@ def to_posed(
     shares: Float[Tensor, "S K"],
     forward: Float[Tensor, "V 3 4"],
 ) -> Float[Tensor, "S 3"]:
-    """Forward skinning with the weights of the nearest canonical vertices."""
+    r"""Forward skinning with the weights of the nearest canonical vertices.
+
+    \[ x_o = \sum_k \omega_k F_{v_k} \, x_c \]
+
+    >>> forward = torch.eye(3, 4).repeat(2, 1, 1)
+    >>> forward[1, 0, 3] = 2.0
+    >>> to_posed(torch.zeros(1, 3), torch.tensor([[0, 1]]), torch.tensor([[0.75, 0.25]]), forward)
+    tensor([[0.5000, 0.0000, 0.0000]])
+
+    Args:
+        x_canonical: points of canonical space, metres.
+        nearest: their K nearest canonical vertices.
+        shares: weight of each of these.
+        forward: `vertex_transforms` of the posed body.
+    """
     rows = weighted_rows(forward.flatten(1), nearest, shares).unflatten(-1, (3, 4))
     return (rows[..., :3] * x_canonical[:, None, :]).sum(-1) + rows[..., 3]

@@ -196,7 +196,8 @@ class FactorizedAvatar(Avatar):
     ) -> PosedAvatar:  # fmt: skip
         """See `Avatar.pose`. While training, a moment's shell is reused until the next refresh."""
         pose, translation = pose.to(self.device), translation.to(self.device)
-        config, training = self.config, step is not None
+        config = self.config
+        training = step is not None
         given, data = self._shape(None), (pose, translation)
         refining = training and step >= config.pose.refine_from
         if time is not None:

@@ -10,7 +10,13 @@ from twofold.volume.samples import Samples
 
 
 def laplace_density(sdf: Float[Tensor, "*b"], beta: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
-    """Volume density of a signed distance (Eq. 7): the Laplace distribution's CDF of -sdf, over its scale.
+    r"""Volume density of a signed distance (Eq. 7): the Laplace distribution's CDF of -sdf, over its scale.
+
+    \[ \sigma(s) = \frac{1}{\beta} \Psi_\beta(-s), \qquad
+    \Psi_\beta(-s) = \begin{cases} \frac12 e^{-s/\beta} & s > 0 \\ 1 - \frac12 e^{s/\beta} & s \le 0 \end{cases} \]
+
+    >>> laplace_density(torch.tensor([-1.0, 0.0, 1.0]), torch.tensor(0.1))
+    tensor([9.9998e+00, 5.0000e+00, 2.2700e-04])
 
     Args:
         sdf: metres, negative inside.
@@ -24,7 +30,20 @@ def laplace_density(sdf: Float[Tensor, "*b"], beta: Float[Tensor, ""]) -> Float[
 
 
 def composite_weights(density: Float[Tensor, "S"], samples: Samples) -> Float[Tensor, "S"]:
-    """What each sample adds to its ray, T_i (1 - exp(-sigma_i delta_i)); a ray's weights sum to at most one."""
+    r"""What each sample adds to its ray; a ray's weights sum to at most one.
+
+    \[ w_i = T_i \, (1 - e^{-\sigma_i \delta_i}), \qquad T_i = \exp\Big(-\sum_{j<i} \sigma_j \delta_j\Big) \]
+
+    Half of the light passes an interval whose density times length is ln 2:
+
+    >>> samples = Samples(torch.tensor([0, 0, 1]), torch.tensor([1.0, 2.0, 1.0]), torch.ones(3))
+    >>> composite_weights(torch.full((3,), 0.693147), samples)
+    tensor([0.5000, 0.2500, 0.5000])
+
+    Args:
+        density: per metre (in the unit of the samples' lengths).
+        samples: packed.
+    """
     optical = density * samples.delta
     return torch.exp(-_optical_depth(optical, samples)) * -torch.expm1(-optical)
 
@@ -32,9 +51,21 @@ def composite_weights(density: Float[Tensor, "S"], samples: Samples) -> Float[Te
 def possible_samples(
     samples: Samples, fewest: Float[Tensor, "S"], most: Float[Tensor, "S"], least: float
 ) -> Bool[Tensor, "S"]:
-    """Which samples can have a weight above `least` when their densities (per metre) lie between two bounds.
+    r"""Which samples can have a weight above `least` when their densities lie between two bounds.
 
-    A weight is largest where the sample itself is as dense, and all before it as thin, as they can be.
+    A weight is largest where the sample itself is as dense, and all before it as thin, as they can be:
+
+    \[ w_i \le e^{-\sum_{j<i} \sigma^{\min}_j \delta_j} \, (1 - e^{-\sigma^{\max}_i \delta_i}) \]
+
+    >>> samples = Samples(torch.tensor([0, 0, 0]), torch.tensor([1.0, 2.0, 3.0]), torch.ones(3))
+    >>> possible_samples(samples, torch.tensor([0.0, 9.0, 9.0]), torch.tensor([0.0, 10.0, 10.0]), 0.01)
+    tensor([False,  True, False])
+
+    Args:
+        samples: packed.
+        fewest: lower bound of each density, per metre.
+        most: upper bound.
+        least: smallest weight that counts.
     """
     reaches = torch.exp(-_optical_depth(fewest * samples.delta, samples))
     return reaches * -torch.expm1(-most * samples.delta) > least
@@ -55,10 +86,15 @@ def _optical_depth(optical: Float[Tensor, "S"], samples: Samples) -> Float[Tenso
 def seen_samples(
     samples: Samples, density: Callable[[Int[Tensor, "n"]], Float[Tensor, "n"]], rays: int, least: float, first: int = 8
 ) -> Bool[Tensor, "S"]:
-    """Which samples add more than `least` to their pixel, found from front to back.
+    r"""Which samples add more than `least` to their pixel, $w_i > w_{\min}$, found from front to back.
 
     Rays are followed a few samples at a time, and no further once less than `least` of their light comes through: what
     lies behind a surface is never asked for.
+
+    >>> samples = Samples(torch.zeros(4, dtype=torch.long), torch.arange(4.0), torch.ones(4))
+    >>> density = torch.tensor([0.0, 1.0, 20.0, 20.0])
+    >>> seen_samples(samples, lambda index: density[index], rays=1, least=0.01, first=2)
+    tensor([False,  True,  True, False])
 
     Args:
         samples: packed.
@@ -95,6 +131,21 @@ def seen_samples(
 def composite(
     weights: Float[Tensor, "S"], values: Float[Tensor, "S C"], samples: Samples, rays: int
 ) -> Float[Tensor, "rays C"]:
-    """Sum of weighted values along each ray (Eq. 8); a ray without samples gets zero."""
+    r"""Sum of weighted values along each ray (Eq. 8); a ray without samples gets zero.
+
+    \[ \hat C(r) = \sum_i T_i \, (1 - e^{-\sigma_i \delta_i}) \, c_i = \sum_i w_i c_i \]
+
+    >>> samples = Samples(torch.tensor([0, 0, 2]), torch.tensor([1.0, 2.0, 1.0]), torch.ones(3))
+    >>> composite(torch.tensor([0.5, 0.25, 1.0]), torch.tensor([[1.0], [0.4], [0.2]]), samples, rays=3)
+    tensor([[0.6000],
+            [0.0000],
+            [0.2000]])
+
+    Args:
+        weights: from `composite_weights`.
+        values: of each sample: colours, or ones for the opacity, or depths.
+        samples: packed.
+        rays: how many there are.
+    """
     out = torch.zeros(rays, values.shape[-1], dtype=values.dtype, device=values.device)
     return out.index_add(0, samples.ray_index, weights[:, None] * values)

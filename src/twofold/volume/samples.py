@@ -23,7 +23,14 @@ class Samples:
     delta: Float[Tensor, "S"]
 
     def points(self, rays: Rays) -> Float[Tensor, "S 3"]:
-        """Positions in the world."""
+        r"""Positions in the world, $x_i = o + t_i d$.
+
+        >>> import torch
+        >>> ray = Rays(torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[0.0, 0.6, 0.8]]), torch.zeros(1), torch.ones(1))
+        >>> Samples(torch.tensor([0, 0]), torch.tensor([0.0, 5.0]), torch.ones(2)).points(ray)
+        tensor([[0., 0., 1.],
+                [0., 3., 5.]])
+        """
         origins, directions = rays.origins[self.ray_index], rays.directions[self.ray_index]
         return origins + self.depth[:, None] * directions
 
