@@ -27,7 +27,15 @@ class PoseRefinement(nn.Module):
     def forward(
         self, time: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"]
     ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
-        """The corrected pose and translation of a moment; moments it does not know stay as they are."""
+        r"""The corrected pose and translation of a moment; moments it does not know stay as they are.
+
+        \[ \theta' = \theta + \Delta\theta_t, \qquad \tau' = \tau + \Delta\tau_t \]
+
+        >>> refinement = PoseRefinement(torch.tensor([4, 7]), 10, ("translation",))
+        >>> _ = refinement.translation.data[1].fill_(0.5)
+        >>> [refinement(time, torch.zeros(24, 3), torch.zeros(3))[1].tolist() for time in (7, 8)]
+        [[0.5, 0.5, 0.5], [0.0, 0.0, 0.0]]
+        """
         row = self.rows.get(time)
         if row is None or not self.parts:
             return pose, translation
@@ -40,9 +48,19 @@ class PoseRefinement(nn.Module):
         pose: Float[Tensor, "24 3"],
         translation: Float[Tensor, "3"],
     ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
-        """A moment that was not trained on, corrected by what its neighbours in time were corrected by.
+        r"""A moment that was not trained on, corrected by what its neighbours in time were corrected by.
 
-        An estimator's errors last longer than a moment. Nothing of the moment's own picture is used.
+        An estimator's errors last longer than a moment. Nothing of the moment's own picture is used. With
+        $u = (t - t_0) / (t_1 - t_0)$ and the corrections $R_i$ and $\Delta\tau_i$ of the neighbours,
+
+        \[ R' = \exp\big((1 - u) \log R_0 + u \log R_1\big) \, R, \qquad
+        \tau' = \tau + (1 - u) \Delta\tau_0 + u \Delta\tau_1 \]
+
+        >>> refinement = PoseRefinement(torch.tensor([0, 4]), 10, ("translation",))
+        >>> _ = refinement.translation.data[1].fill_(1.0)
+        >>> known = tuple((time, torch.zeros(24, 3), torch.zeros(3)) for time in (0, 4))
+        >>> refinement.between(known, 1, torch.zeros(24, 3), torch.zeros(3))[1]
+        tensor([0.2500, 0.2500, 0.2500], grad_fn=<AddBackward0>)
 
         Args:
             neighbours: the moments before and after it that were trained on, each with its pose and translation as
@@ -63,7 +81,17 @@ class PoseRefinement(nn.Module):
         return turned, translation + shift
 
     def change(self) -> dict[str, float]:
-        """Root-mean-square size of the corrections: radians for the rotations, metres for the translation."""
+        r"""Root-mean-square size of the corrections: radians for the rotations, metres for the translation.
+
+        \[ \sqrt{ \tfrac{1}{n} \sum_i \lVert \Delta_i \rVert^2 } \]
+
+        over moments (and joints); of the shape the norm.
+
+        >>> refinement = PoseRefinement(torch.tensor([0, 4]), 10, ("translation",))
+        >>> refinement.translation.data[0, 0] = 0.2
+        >>> round(refinement.change()["translation"], 4)
+        0.1414
+        """
         tables = {"root": self.root, "body": self.body, "translation": self.translation}
         norms = {name: t.detach().square().sum(-1).mean().sqrt() for name, t in tables.items()}
         return {name: float(value) for name, value in norms.items()} | {"shape": float(self.shape.detach().norm())}

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def encoding_size(octaves: int, dimensions: int = 3) -> int:
-    """Columns that `fourier_encoding` gives for points of space, or for rows of `dimensions` numbers.
+    r"""Columns that `fourier_encoding` gives for points of space, or for rows of `dimensions` numbers: $d (1 + 2L)$.
 
     >>> encoding_size(5), encoding_size(10), encoding_size(10, 4)
     (33, 63, 84)
@@ -17,7 +17,10 @@ def encoding_size(octaves: int, dimensions: int = 3) -> int:
 
 
 def fourier_encoding(x: Float[Tensor, "S d"], octaves: int, include_pi: bool) -> Float[Tensor, "S C"]:
-    """The point beside its sines and cosines at doubling frequencies (Eqs. 2, 4).
+    r"""The point beside its sines and cosines at doubling frequencies (Eqs. 2, 4).
+
+    \[ \gamma_L(x) = \big( x, \sin(f_0 x), \cos(f_0 x), \dots, \sin(f_{L-1} x), \cos(f_{L-1} x) \big), \qquad
+    f_k = 2^k \pi \text{ as printed, } 2^k \text{ as released} \]
 
     >>> fourier_encoding(torch.tensor([[0.0, 0.5, 1.0]]), octaves=1, include_pi=True).round(decimals=3).abs()
     tensor([[0.0000, 0.5000, 1.0000, 0.0000, 1.0000, 0.0000, 1.0000, 0.0000, 1.0000]])
@@ -38,9 +41,15 @@ def fourier_encoding(x: Float[Tensor, "S d"], octaves: int, include_pi: bool) ->
 def encoding_pullback(
     encoded: Float[Tensor, "S C"], cotangent: Float[Tensor, "S C"], include_pi: bool
 ) -> Float[Tensor, "S 3"]:
-    """J^T u, where J is the Jacobian of `fourier_encoding` by the points: the last step of a gradient's reverse pass.
+    r"""$J^\top u$ with the Jacobian $J$ of `fourier_encoding` by points: the last step of a gradient's reverse pass.
 
-    A sine's derivative is the cosine beside it, so the encoded points are all it needs.
+    A sine's derivative is the cosine beside it, so the encoded points are all it needs:
+
+    \[ J^\top u = u_x + \sum_k f_k \big( u_{\sin,k} \cos(f_k x) - u_{\cos,k} \sin(f_k x) \big) \]
+
+    >>> encoded = fourier_encoding(torch.zeros(1, 3), octaves=2, include_pi=False)
+    >>> encoding_pullback(encoded, torch.ones(1, 15), include_pi=False)  # 1 + 2^0 + 2^1 at zero
+    tensor([[4., 4., 4.]])
 
     Args:
         encoded: what `fourier_encoding` gave.
@@ -60,9 +69,11 @@ def _frequencies(like: Tensor, octaves: int, include_pi: bool) -> Float[Tensor, 
 
 
 def hann_encoding(x: Float[Tensor, "S d"], octaves: int, open_bands: float) -> Float[Tensor, "S C"]:
-    """Sines and cosines at doubling frequencies whose bands open one after the other (HumanNeRF Eq. 9).
+    r"""Sines and cosines at doubling frequencies whose bands open one after the other (HumanNeRF Eq. 9).
 
-    Band k is multiplied by (1 - cos(pi clamp(open_bands - k, 0, 1))) / 2; x itself is not among the columns.
+    \[ w_k = \tfrac12 \big( 1 - \cos(\pi \, \mathrm{clamp}(\alpha - k, 0, 1)) \big) \]
+
+    is the factor of band k, with $\alpha$ the bands that are open; x itself is not among the columns.
 
     >>> hann_encoding(torch.zeros(1, 1), octaves=3, open_bands=1.5).round(decimals=2)
     tensor([[0.0000, 1.0000, 0.0000, 0.5000, 0.0000, 0.0000]])
@@ -82,7 +93,9 @@ def hann_encoding(x: Float[Tensor, "S d"], octaves: int, open_bands: float) -> F
 
 
 def open_hann_bands(step: int, first_step: int, last_step: int, octaves: int) -> float:
-    """How many bands of `hann_encoding` are open at a training step: L max(step - first, 0) / (last - first).
+    r"""How many bands of `hann_encoding` are open at a training step.
+
+    \[ \alpha = L \, \frac{\max(i - i_{\text{first}}, 0)}{i_{\text{last}} - i_{\text{first}}} \]
 
     >>> open_hann_bands(30_000, first_step=10_000, last_step=50_000, octaves=6)
     3.0

@@ -183,7 +183,13 @@ class FactorizedField(nn.Module):
     def base_branch(
         self, x: Float[Tensor, "S 3"], networks: ReadyBranch, to_observation: Float[Tensor, "S 3 3"] | None
     ) -> Branch:
-        """s1, f_sdf = MLP_sdf(encoded x) and c1, f_c = MLP_c(f_sdf, n1), with n1 the normal of s1 (Eq. 3)."""
+        r"""The pose-independent branch: signed distance, colour and features (Eq. 3).
+
+        \[ s_1, \bar f_{sdf} = \overline{\mathrm{MLP}}_{sdf}(\bar\gamma(x_c)), \qquad
+        c_1, \bar f_c = \overline{\mathrm{MLP}}_c(\bar f_{sdf}, n_1) \]
+
+        with the normal $n_1$ of $s_1$; the released program shows the colour network $x_c$ as well.
+        """
         geometry = self._geometry(self._encoded(x, self.config.low_octaves), None, networks)
         gradient = self._gradient(x, geometry.sdf, geometry.pull_sdf)
         hidden = networks.color.hidden(self._color_input(x, gradient, to_observation, geometry.feature))
@@ -196,9 +202,13 @@ class FactorizedField(nn.Module):
         networks: ReadyBranch,
         to_observation: Float[Tensor, "S 3 3"] | None,
     ) -> Branch:
-        """s2, f = MLP_sdf(encoded x, f_sdf, pose) and c2 = MLP_c(f, f_c, n, pose), with n the normal of s (Eq. 5).
+        r"""The pose-dependent branch: what the pose adds to distance and colour (Eq. 5).
 
-        The networks have taken in the pose already. A field that shows this branch alone has s2 for s.
+        \[ s_2, \tilde f_{sdf} = \widetilde{\mathrm{MLP}}_{sdf}(\tilde\gamma(x_c), \bar f_{sdf}, \theta), \quad
+        c_2 = \widetilde{\mathrm{MLP}}_c(\tilde f_{sdf}, \bar f_c, n, \theta) \]
+
+        with the normal $n$ of $s$. The networks have taken in the pose already. A field that shows this branch alone
+        has s2 for s.
         """
         low = None if base is None else base.geometry
         geometry = self._geometry(self._encoded(x, self.config.high_octaves), low, networks)
@@ -213,10 +223,16 @@ class FactorizedField(nn.Module):
     def combine(
         self, base: Float[Tensor, "S *c"], detail: Float[Tensor, "S *c"], base_sdf: Float[Tensor, "S"]
     ) -> Float[Tensor, "S *c"]:
-        """Adds the branches, s = s1 + s2 and c = c1 + c2 (Eq. 6), and likewise the gradients of s.
+        r"""Adds the branches (Eq. 6), and likewise the gradients of s.
 
-        With a gate the detail fades away from the base branch's surface. No gradient passes through the gate, so the
-        gradient of s is that of s1 plus the gated one of s2.
+        \[ s = s_1 + w s_2, \qquad c = c_1 + w c_2, \qquad w = \frac{1}{1 + (s_1 / b)^4} \]
+
+        with $w = 1$ in the text. With a gate of width $b$ the detail fades away from the base branch's surface. No
+        gradient passes through the gate, so the gradient of s is that of s1 plus the gated one of s2.
+
+        >>> field = FactorizedFieldConfig(gate_width=0.05, width=72, high_octaves=2).build()
+        >>> field.combine(torch.tensor([0.0, 0.05]), torch.tensor([0.01, 0.01]), torch.tensor([0.0, 0.05]))
+        tensor([0.0100, 0.0550])
         """
         if self.config.gate_width is None:
             return base + detail

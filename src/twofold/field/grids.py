@@ -37,7 +37,14 @@ class Lattices:
 def build_lattices(
     points: Float[np.ndarray, "n 3"], voxels: tuple[float, ...], radius: float
 ) -> tuple[Lattices, Float[np.ndarray, "N 3"]]:
-    """The nodes within `radius` metres (plus a cell's diagonal) of surface points, for each spacing.
+    r"""The nodes within `radius` metres (plus a cell's diagonal) of surface points, for each spacing.
+
+    Node $i$ of a level with the corner $l$ and the spacing $h$ lies at $l + h \, i$; kept are those with
+    $\min_p \lVert l + h i - p \rVert \le r + (1 + \sqrt 3) h$ of a point's nearest node.
+
+    >>> lattices, positions = build_lattices(np.zeros((1, 3), np.float32), (0.1, 0.05), radius=0.02)
+    >>> lattices.place[:, 3], len(positions) == int(lattices.rows.max()) + 1
+    (tensor([10., 20.]), True)
 
     Returns:
         the lattices, and the position of each table row (a level's first row stands for everywhere else).
@@ -69,7 +76,16 @@ def build_lattices(
 
 
 def corners(x: Float[Tensor, "S 3"], lattices: Lattices, level: int) -> tuple[Int[Tensor, "S 8"], Float[Tensor, "S 3"]]:
-    """Table rows of the eight nodes around each point, and its position in the cell (0..1), in PyTorch."""
+    r"""Table rows of the eight nodes around each point, and its position in the cell (0..1), in PyTorch.
+
+    \[ u = (x - l) / h, \qquad \text{cell } \lfloor u \rfloor, \quad \text{position } u - \lfloor u \rfloor \]
+
+    >>> lattices, positions = build_lattices(np.zeros((1, 3), np.float32), (0.1,), radius=0.2)
+    >>> rows, part = corners(torch.tensor([[0.03, 0.0, 0.0]]), lattices, 0)
+    >>> nodes = torch.from_numpy(positions)[rows[0]]
+    >>> nodes.amin(0) + 0.1 * part[0]  # the lowest corner and the way from it give the point back
+    tensor([0.0300, 0.0000, 0.0000])
+    """
     shape = lattices.shape[level]
     unit = (x - lattices.place[level, :3].to(x.dtype)) * lattices.place[level, 3].to(x.dtype)
     unit = torch.minimum(unit.clamp_min(0), shape[:3].to(x.dtype) - 1.001)
@@ -83,7 +99,13 @@ def corners(x: Float[Tensor, "S 3"], lattices: Lattices, level: int) -> tuple[In
 def interpolate_in_torch(
     table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], lattices: Lattices
 ) -> Float[Tensor, "S LC"]:
-    """`interpolate` by ordinary PyTorch operations, with all derivatives: for GPUs, and the compiled form's twin."""
+    """`interpolate` by ordinary PyTorch operations, with all derivatives: for GPUs, and the compiled form's twin.
+
+    >>> lattices, positions = build_lattices(np.zeros((1, 3), np.float32), (0.1,), radius=0.2)
+    >>> x = torch.tensor([[0.03, -0.02, 0.11]])
+    >>> torch.allclose(interpolate_in_torch(torch.from_numpy(positions), x, lattices), x, atol=1e-6)
+    True
+    """
     features = []
     for level in range(len(lattices.place)):
         index, part = corners(x, lattices, level)
@@ -97,7 +119,13 @@ def interpolate_in_torch(
 def pullback_in_torch(
     table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], cotangent: Float[Tensor, "S LC"], lattices: Lattices
 ) -> Float[Tensor, "S 3"]:
-    """`interpolation_pullback` by ordinary PyTorch operations."""
+    """`interpolation_pullback` by ordinary PyTorch operations.
+
+    >>> lattices, positions = build_lattices(np.zeros((1, 3), np.float32), (0.1,), radius=0.2)
+    >>> u = torch.tensor([[1.0, 2.0, 3.0]])
+    >>> pullback_in_torch(torch.from_numpy(positions), torch.tensor([[0.03, -0.02, 0.11]]), u, lattices)
+    tensor([[1.0000, 2.0000, 3.0000]])
+    """
     total = torch.zeros_like(x)
     for level, u in enumerate(cotangent.chunk(len(lattices.place), -1)):
         index, part = corners(x.detach(), lattices, level)
@@ -171,7 +199,22 @@ class _Pullback(torch.autograd.Function):
 
 
 def interpolate(table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], lattices: Lattices) -> Float[Tensor, "S LC"]:
-    """Trilinear features of all levels side by side; differentiable by the table and by the points."""
+    r"""Trilinear features of all levels side by side; differentiable by the table and by the points.
+
+    \[ f(x) = \sum_{k \in \{0,1\}^3} F_k \prod_{i=1}^3 (1 - u_i)^{1 - k_i} \, u_i^{k_i} \]
+
+    with the position $u$ in the cell and the features $F_k$ at its corners.
+
+    >>> lattices, positions = build_lattices(np.zeros((1, 3), np.float32), (0.1,), radius=0.2)
+    >>> table = torch.from_numpy(positions)  # each node's feature is its own place, which is linear
+    >>> interpolate(table, torch.tensor([[0.03, -0.02, 0.11]]), lattices)
+    tensor([[ 0.0300, -0.0200,  0.1100]])
+
+    Args:
+        table: a feature vector for each row.
+        x: points, metres.
+        lattices: where the nodes of the table's rows lie.
+    """
     if table.dtype != torch.float32 or table.is_cuda:
         return interpolate_in_torch(table, x, lattices)
     return _Interpolate.apply(table, x, lattices)  # type: ignore[return-value]
@@ -180,7 +223,14 @@ def interpolate(table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], lattices: 
 def interpolation_pullback(
     table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], cotangent: Float[Tensor, "S LC"], lattices: Lattices
 ) -> Float[Tensor, "S 3"]:
-    """J^T u, where J is the Jacobian of `interpolate` by the points: the last step of a gradient's reverse pass.
+    r"""$J^\top u$ with the Jacobian $J$ of `interpolate` by the points: the last step of a gradient's reverse pass.
+
+    The derivative of a factor $1 - u_i$ or $u_i$ is $\mp 1 / h$.
+
+    >>> lattices, positions = build_lattices(np.zeros((1, 3), np.float32), (0.1,), radius=0.2)
+    >>> table, u = torch.from_numpy(positions), torch.tensor([[1.0, 2.0, 3.0]])
+    >>> interpolation_pullback(table, torch.tensor([[0.03, -0.02, 0.11]]), u, lattices)
+    tensor([[1.0000, 2.0000, 3.0000]])
 
     Differentiable by the table and the cotangent, so a loss on the gradient trains both; the points count as constants.
     """
@@ -224,10 +274,19 @@ class FeatureGrid(nn.Module):
 def body_distance(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Approximate signed distance to a body, metres, negative inside.
+    r"""Approximate signed distance to a body, metres, negative inside.
 
     The offsets to the nearest vertices, projected on their normals and averaged: exact to a few millimetres near the
     surface, which is all that a prior needs.
+
+    \[ d(x) \approx \sum_k w_k \, (x - v_k) \cdot n_k \, \Big/ \sum_k w_k, \qquad w_k = 1 / \lVert x - v_k \rVert^2 \]
+
+    within 2 cm; further out its sign times the distance to the nearest vertex.
+
+    >>> corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    >>> faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    >>> body_distance(np.array([[2.0, 0, 0], [0.2, 0.2, 0.2]], np.float32), corner, faces).round(2)
+    array([ 1.  , -0.35], dtype=float32)
     """
     x, corners = torch.from_numpy(points), torch.from_numpy(vertices)
     distance, nearest = nearest_vertices(x, corners, k=min(6, len(corners)))

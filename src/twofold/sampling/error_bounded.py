@@ -23,7 +23,11 @@ LARGEST_ERROR = 1e6
 
 
 def uniform_depths(rays: Rays, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "R count"]:
-    """Ascending depths from near to far: evenly spaced, both ends included, or one at random in each stratum.
+    r"""Ascending depths from near to far: evenly spaced, both ends included, or one at random in each stratum.
+
+    \[ t_i = t_n + \frac{i}{n - 1} (t_f - t_n), \qquad i = 0 \dots n - 1 \]
+
+    and with a generator uniform between the middles to the neighbours of $t_i$.
 
     >>> ray = Rays(torch.zeros(1, 3), torch.eye(3)[:1], torch.tensor([1.0]), torch.tensor([2.0]))
     >>> uniform_depths(ray, 5)
@@ -44,7 +48,9 @@ def uniform_depths(rays: Rays, count: int, generator: torch.Generator | None = N
 
 
 def samples_between(depths: Float[Tensor, "R n"]) -> Samples:
-    """Packed samples at all depths of each ray but the last, which only ends the last interval.
+    r"""Packed samples at all depths of each ray but the last, which only ends the last interval.
+
+    \[ \delta_i = t_{i+1} - t_i \]
 
     >>> samples_between(torch.tensor([[1.0, 1.5, 3.0]]))
     Samples(ray_index=tensor([0, 0]), depth=tensor([1.0000, 1.5000]), delta=tensor([0.5000, 1.5000]))
@@ -57,7 +63,14 @@ def samples_between(depths: Float[Tensor, "R n"]) -> Samples:
 def invert(
     depths: Float[Tensor, "R n"], shares: Float[Tensor, "R m"], quantiles: Float[Tensor, "R q"]
 ) -> Float[Tensor, "R q"]:
-    """Depths at quantiles of a distribution that is constant within each section (inverse transform sampling).
+    r"""Depths at quantiles of a distribution that is constant within each section (inverse transform sampling).
+
+    \[ t(q) = t_i + \frac{q - F_i}{F_{i+1} - F_i} (t_{i+1} - t_i), \qquad F_i = \frac{\sum_{j<i} p_j}{\sum_j p_j}
+    \le q < F_{i+1} \]
+
+    >>> depths, weights = torch.tensor([[0.0, 1.0, 3.0]]), torch.tensor([[1.0, 3.0]])
+    >>> invert(depths, weights, torch.tensor([[0.0, 0.25, 0.625]]))
+    tensor([[0., 1., 2.]])
 
     Args:
         depths: n ascending ends of the m = n - 1 sections.
@@ -76,7 +89,16 @@ def invert(
 
 
 def surface_clearance(delta: Float[Tensor, "R m"], sdf: Float[Tensor, "R n"]) -> Float[Tensor, "R m"]:
-    """How far a whole section stays from the surface at least, from the distances at its two ends.
+    r"""How far a whole section stays from the surface at least, from the distances at its two ends.
+
+    With the length $a$ and the distances $b$ and $c$ it is the triangle's height on $a$,
+
+    \[ d^* = \frac{2}{a} \sqrt{p (p - a)(p - b)(p - c)}, \qquad p = \tfrac12 (a + b + c), \]
+
+    or $b$ where $a^2 + b^2 \le c^2$, $c$ where $a^2 + c^2 \le b^2$, and 0 where the sign changes or $b + c \le a$.
+
+    >>> surface_clearance(torch.tensor([[0.5, 0.5]]), torch.tensor([[0.3, 0.4, -0.1]]))
+    tensor([[0.2400, 0.0000]])
 
     No surface lies inside the balls around the ends that their distances span. Where these meet over the section, its
     way out of them is their common chord; where they do not, or where the sign changes, the surface may cross it.
@@ -187,7 +209,15 @@ class ErrorBoundedSampler:
         beta: Float[Tensor, ""],
         known: Float[Tensor, "R"],
     ) -> Float[Tensor, "R"]:
-        """The smallest scale of the density, not below `beta`, for which the opacity's error is within the tolerance.
+        r"""The smallest scale of the density, not below `beta`, for which the opacity's error is within the tolerance.
+
+        \[ \beta_+ = \min \{ \beta' \ge \beta : \max_k B_k(\beta') \le \epsilon \} \]
+
+        with `error_bound` for $B_k$, found by bisection.
+
+        >>> depths, far_off = torch.tensor([[0.0, 0.5, 1.0]]), torch.tensor([[2.0, 2.0, 2.0]])
+        >>> ErrorBoundedSampler().smallest_scale(depths, far_off, torch.tensor(0.1), torch.tensor([1.0]))
+        tensor([0.1000])
 
         Args:
             depths: ascending.
@@ -246,7 +276,16 @@ def error_bound(
     clearance: Float[Tensor, "R m"],
     scale: Float[Tensor, "R"],
 ) -> Float[Tensor, "R m"]:
-    """Bound on the error of the opacity up to each section, if the density had this scale.
+    r"""Bound on the error of the opacity up to each section, if the density had this scale (VolSDF).
+
+    \[ B_k = \exp\Big(-\sum_{j<k} \delta_j \sigma_j\Big) \Big( \min\big(e^{\sum_{i \le k} E_i}, 10^6\big) - 1 \Big),
+    \qquad E_i = \frac{\delta_i^2}{4 \beta^2} \, e^{-d^*_i / \beta} \]
+
+    with `surface_clearance` for $d^*$.
+
+    >>> delta, sdf = torch.tensor([[0.1, 0.1]]), torch.tensor([[0.3, 0.1, -0.1]])
+    >>> error_bound(delta, sdf, surface_clearance(delta, sdf), torch.tensor([0.1]))
+    tensor([[0.0963, 0.3977]])
 
     Args:
         delta: length of each section.

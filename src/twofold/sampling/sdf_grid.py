@@ -29,7 +29,12 @@ class DistanceTable:
         return len(self.values)
 
     def bounds(self, x: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S"]]:
-        """Least and greatest distance that the field may have at points, metres; infinite where the lattice ends."""
+        r"""Least and greatest distance that the field may have at points, metres; infinite where the lattice ends.
+
+        \[ \tilde s(x) - \epsilon \le s(x) \le \tilde s(x) + \epsilon \]
+
+        with the interpolated distance $\tilde s$ and the table's doubt $\epsilon$; an example stands at `tabulate`.
+        """
         middle = interpolate(self.values, x, self.lattices)[:, 0]
         unknown = middle.isnan()
         return (
@@ -47,7 +52,16 @@ def tabulate(
     chunk: int = 65_536,
     trials: int = 4096,
 ) -> DistanceTable:
-    """Asks a field at the nodes of a lattice, and between some of them how good the interpolation is.
+    r"""Asks a field at the nodes of a lattice, and between some of them how good the interpolation is.
+
+    \[ \epsilon = \tfrac32 \max_t |\tilde s(x_t) - s(x_t)| \]
+
+    over the places $x_t$ of the trials.
+
+    >>> table = tabulate(lambda x: x[:, 0] - 0.2, torch.zeros(1, 3), voxel=0.1, radius=0.3)
+    >>> low, high = table.bounds(torch.tensor([[0.25, 0.0, 0.0], [9.0, 0.0, 0.0]]))
+    >>> low, high  # a plane is interpolated without error
+    (tensor([0.0500,   -inf]), tensor([0.0500,    inf]))
 
     Args:
         distance: the field's signed distance, metres.

@@ -47,7 +47,13 @@ class Shell:
         return self.low + self.voxel * size
 
     def rows_at(self, points: Float[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
-        """Row of the voxel that each point lies in, or a negative number."""
+        r"""Row of the voxel $\lfloor (x - l) / h \rfloor$ that each point lies in, or a negative number.
+
+        >>> corners = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+        >>> shell = build_shell(corners, torch.tensor([[0, 1, 2]]), radius=0.05, voxel=0.02)
+        >>> shell.rows_at(torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.0, 0.3]])) >= 0
+        tensor([ True, False])
+        """
         cell = ((points - self.low) * (1 / self.voxel)).floor()
         x, y, z = self.row.shape
         flat = (cell[..., 0] * y + cell[..., 1]) * z + cell[..., 2]
@@ -59,7 +65,18 @@ class Shell:
 def build_shell(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], radius: float, voxel: float, candidates: int = 6
 ) -> Shell:
-    """Lists the voxels within `radius` of the vertices, and for each the vertices that may be nearest in it.
+    r"""Lists the voxels within `radius` of the vertices, and for each the vertices that may be nearest in it.
+
+    A voxel with the centre $c$ and the edge $h$ is listed where
+
+    \[ \min_v \lVert c - v \rVert \le r + \tfrac{\sqrt 3}{2} h, \]
+
+    so that no point within $r$ of a vertex is missed.
+
+    >>> corners = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    >>> shell = build_shell(corners, torch.tensor([[0, 1, 2]]), radius=0.05, voxel=0.02, candidates=2)
+    >>> shell.nearest.shape[1], bool(shell.rows_at(corners + 0.02).min() >= 0)
+    (2, True)
 
     Args:
         vertices: posed (or canonical) vertices, metres.
@@ -99,7 +116,16 @@ def build_shell(
 def nearest_listed(
     shell: Shell, points: Float[Tensor, "S 3"], rows: Int[Tensor, "S"], k: int
 ) -> tuple[Int[Tensor, "S k"], Float[Tensor, "S k"]]:
-    """The k nearest vertices of points in the shell and their squared distances (metres squared), nearest first.
+    r"""The k nearest vertices of points in the shell and their squared distances (metres squared), nearest first.
+
+    \[ v_1 = \arg\min_{v \in C(x)} \lVert x - v \rVert^2 \]
+
+    and so on, among the candidates $C(x)$ of the point's voxel.
+
+    >>> corners = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    >>> shell, x = build_shell(corners, torch.tensor([[0, 1, 2]]), 0.05, 0.02), torch.tensor([[0.09, 0.0, 0.02]])
+    >>> nearest_listed(shell, x, shell.rows_at(x), k=1)
+    (tensor([[1]]), tensor([[0.0005]]))
 
     Sought among the candidates of each point's voxel, so some are missed where vertices lie denser than voxels.
     Around an Anny body (14,000 vertices, voxels of 2 cm) the nearest one found is 0.6 mm too far on average with six
@@ -118,7 +144,18 @@ def nearest_listed(
 def sample_shell(
     shell: Shell, rays: Rays, step: float, generator: torch.Generator | None, limit: float
 ) -> tuple[Samples, Int[Tensor, "S 1"], Float[Tensor, "S 1"]]:
-    """Samples every `step` metres along each ray, kept only within `limit` of the body.
+    r"""Samples every `step` metres along each ray, kept only within `limit` of the body.
+
+    \[ t_i = t_n + (i + u) h, \qquad \min_v \lVert o + t_i d - v \rVert < r, \qquad \delta_i = h \]
+
+    with $u$ random for each ray, or a half.
+
+    >>> corners = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    >>> shell = build_shell(corners, torch.tensor([[0, 1, 2]]), radius=0.05, voxel=0.02)
+    >>> ray = Rays(torch.tensor([[0.0, 0, -1]]), torch.tensor([[0.0, 0, 1]]), torch.zeros(1), torch.tensor([2.0]))
+    >>> samples, nearest, squared = sample_shell(shell, ray, step=0.02, generator=None, limit=0.03)
+    >>> samples.depth.round(decimals=2), nearest[:, 0].tolist()
+    (tensor([0.9800, 1.0000, 1.0200]), [0, 0, 0])
 
     Args:
         shell: where to sample.
