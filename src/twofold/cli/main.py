@@ -4,6 +4,7 @@ What a command needs is imported when it runs, so that `--help` answers at once.
 """
 
 import functools
+import logging
 import os
 import shlex
 import sys
@@ -299,6 +300,8 @@ def _run(words: list[str]) -> None:
         from twofold.kernels.runtime import tune_process
 
         tune_process()
+        # Where no cache is writable, it would report where it keeps its fonts instead.
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
         command()
     except TwofoldError as error:
         print(f"twofold{'' if ALONE else ', process ' + os.environ['RANK']}: {error}", file=sys.stderr)
@@ -306,8 +309,7 @@ def _run(words: list[str]) -> None:
     except Exception as error:  # the last net
         from twofold.cli.faults import explain
 
-        given = sys.argv[1:] if arguments is None else arguments
-        print(f"twofold{'' if ALONE else ', process ' + os.environ['RANK']}: {explain(error, given)}", file=sys.stderr)
+        print(f"twofold{'' if ALONE else ', process ' + os.environ['RANK']}: {explain(error, words)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
         if ALONE:
