@@ -203,6 +203,11 @@ class Avatar(nn.Module, ABC):
         """Zero on the surface in canonical space, negative inside; of the "full" field or its "base" branch."""
 
     @property
+    def reach(self) -> float:
+        """Points of observation space further than this from the body's vertices are empty, metres."""
+        return 0.1
+
+    @property
     def separates_light(self) -> bool:
         """Whether `query` can leave the lighting out of the colours."""
         return False

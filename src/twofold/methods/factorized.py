@@ -364,6 +364,12 @@ class FactorizedAvatar(Avatar):
         return self.query(x_canonical, posed, branch=branch).sdf
 
     @property
+    def reach(self) -> float:
+        """See `Avatar.reach`."""
+        sampler, limit = self.config.sampler, self.config.outlier_distance / self.scale
+        return min(sampler.radius, limit) if isinstance(sampler, ShellSampler) else limit
+
+    @property
     def separates_light(self) -> bool:
         """See `Avatar.separates_light`."""
         return isinstance(self.field, GridField)

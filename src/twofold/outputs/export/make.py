@@ -1,0 +1,181 @@
+"""A character from an avatar and its capture: shape, colours, texture."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from twofold.capture.types import Capture, Frame, spread
+from twofold.errors import TwofoldError
+from twofold.methods.base import Avatar, PosedAvatar
+from twofold.outputs.export.atlas import Atlas, as_bytes_image, dilated, paint_texture, tangents, unwrap
+from twofold.outputs.export.bake import BakeConfig, BakedShape, Pose, Progress, bake_colors, bake_normals, bake_shape
+from twofold.outputs.export.character import Character, normals_of
+from twofold.outputs.export.lattice import TriangleLattice, build_lattice, segments_for
+from twofold.outputs.export.morphs import PulledBack, pull_back
+
+QUERIES = 3_000_000
+"""Points that the field is asked for the colours of one character, over all poses."""
+_NORMAL_FRAMES = 4
+
+Shown = Sequence[tuple[PosedAvatar, PulledBack]]
+
+
+@dataclass(frozen=True)
+class Baked:
+    """A character and what its clips and still poses are made with.
+
+    Attributes:
+        avatar: that it was made from.
+        capture: for frames.
+        config: how.
+        shape: its surface.
+        character: rigged, without clips.
+    """
+
+    avatar: Avatar
+    capture: Capture
+    config: BakeConfig
+    shape: BakedShape
+    character: Character
+
+
+def frame_at(capture: Capture, index: int) -> Frame:
+    """A frame of any split by its index, a training frame first.
+
+    Raises:
+        TwofoldError: there is none.
+    """
+    for split in ("train", *capture.splits):
+        for frame in capture.splits.get(split, ()):
+            if frame.time == index:
+                return frame
+    known = sorted({frame.time for frames in capture.splits.values() for frame in frames})
+    raise TwofoldError(f"{capture.folder} has no frame {index}; its frames lie between {known[0]} and {known[-1]}.")
+
+
+def pose_of(capture: Capture, frame: Frame) -> Pose:
+    """A frame's pose; one that was trained on takes its learned correction."""
+    trained = any(frame.time == other.time for other in capture.train)
+    return Pose(frame.pose, frame.translation, frame.time if trained else None)
+
+
+def training_poses(capture: Capture) -> list[Pose]:
+    """The poses of the training frames, in the order of time."""
+    moments = {frame.time: frame for frame in capture.train}
+    return [pose_of(capture, moments[time]) for time in sorted(moments)]
+
+
+def bake(
+    avatar: Avatar,
+    capture: Capture,
+    config: BakeConfig,
+    color: str | int = "full",
+    name: str = "avatar",
+    progress: Progress = lambda _done, _note: None,
+) -> Baked:
+    """The avatar as a rigged, coloured character.
+
+    Args:
+        avatar: trained.
+        capture: that it was trained on.
+        config: how.
+        color: "full" for the mean of the full field over some training poses, "base" for that of the base branch, or a
+            frame's index for the full field in that frame's pose.
+        name: of the character.
+        progress: told the share that is done and what comes next.
+
+    Raises:
+        TwofoldError: there is no such frame, no surface, or a package is missing.
+    """
+    one = None if isinstance(color, str) else pose_of(capture, frame_at(capture, color))
+    shape = bake_shape(avatar, training_poses(capture), config, lambda done, note: progress(0.5 * done, note))
+    progress(0.5, "colours")
+    lit = config.lit or not avatar.separates_light
+    shown: Shown = shape.shown
+    if one is not None:
+        posed = one.of(avatar)
+        shown = [(posed, pull_back(avatar, posed, shape.skin, config.branch))]
+    vertices, faces = shape.skin.vertices.cpu().numpy(), shape.skin.faces.cpu().numpy()
+    # The lattice is as fine for one pose as a texture shows, and coarser where many poses are averaged.
+    segments = segments_for(len(vertices), len(faces), QUERIES // (2 * len(shown))) if config.texture else 1
+    lattice = build_lattice(len(vertices), faces, segments)
+    branch = "base" if color == "base" or config.branch == "base" else "full"
+    colors = bake_colors(avatar, shown, lattice.interpolate, branch, lit).cpu().numpy()
+    character = Character(
+        name=name,
+        vertices=vertices,
+        faces=faces,
+        joints=shape.skin.rest.joints.cpu().numpy(),
+        weights=shape.skin.weights.cpu().numpy(),
+        targets=shape.targets.cpu().numpy(),
+        clips=(),
+        colors=colors[: len(vertices)],
+        lit=lit,
+    )
+    if config.texture:
+        progress(0.7, "atlas")
+        atlas = unwrap(vertices, faces, config.texture)
+        progress(0.85, "texture")
+        texture, _ = paint_texture(atlas, lattice, colors, config.texture)
+        normals = None
+        if not lit:
+            wanted = bake_normals(avatar, spread(shape.shown, _NORMAL_FRAMES), lattice.interpolate, config.branch)
+            normals = normal_map(character, atlas, lattice, wanted.cpu().numpy(), config.texture)
+        character = replace(character, atlas=atlas, texture=as_bytes_image(texture), normal_map=normals)
+    progress(1.0, "")
+    return Baked(avatar, capture, config, shape, character)
+
+
+def normal_map(
+    character: Character, atlas: Atlas, lattice: TriangleLattice, wanted: Float[np.ndarray, "N 3"], size: int
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Normals of the rest pose, given at the lattice's nodes, as glTF's tangent-space image.
+
+    Args:
+        character: whose vertices have the normals that the image is relative to.
+        atlas: of its mesh.
+        lattice: of its mesh.
+        wanted: unit normals at the nodes.
+        size: edge of the image, texels.
+    """
+    own = normals_of(character.vertices, character.faces)
+    frame = np.concatenate([own[atlas.vertex], tangents(atlas, character.vertices, own)], 1)
+    corners = TriangleLattice(1, torch.zeros(0, 3, dtype=torch.long), torch.zeros(0, 3), _corner_table(atlas))
+    local, known = paint_texture(atlas, corners, frame, size)
+    image, _ = paint_texture(atlas, lattice, wanted, size)
+    flat = np.zeros((size, size, 3), dtype=np.float32)
+    n, t, sign = local[known, :3], local[known, 3:6], np.sign(local[known, 6:7])
+    n /= np.linalg.norm(n, axis=1, keepdims=True).clip(1e-9)
+    t /= np.linalg.norm(t, axis=1, keepdims=True).clip(1e-9)
+    here = image[known]
+    parts = np.stack([(here * axis).sum(1) for axis in (t, sign * np.cross(n, t), n)], 1)
+    parts[:, 2] = parts[:, 2].clip(0.2)  # an image cannot turn a normal into the surface
+    flat[known] = parts / np.linalg.norm(parts, axis=1, keepdims=True).clip(1e-9)
+    return as_bytes_image(0.5 + 0.5 * dilated(flat, known))
+
+
+def _corner_table(atlas: Atlas) -> np.ndarray:
+    """The atlas's triangles as a lattice of one segment: nodes (0, 0), (0, 1), (1, 0)."""
+    return np.ascontiguousarray(atlas.faces[:, [0, 2, 1]]).astype(np.int32)
+
+
+def still(baked: Baked, index: int, turn: Callable[[Tensor], Tensor] = lambda x: x) -> Character:
+    """The character's mesh as the avatar stands in a frame, without a rig.
+
+    Args:
+        baked: from `bake`.
+        index: of the frame.
+        turn: takes positions of the capture's world to those of the file.
+
+    Raises:
+        TwofoldError: there is no such frame.
+    """
+    posed = pose_of(baked.capture, frame_at(baked.capture, index)).of(baked.avatar)
+    back = pull_back(baked.avatar, posed, baked.shape.skin, baked.config.branch)
+    vertices = turn(back.posed).cpu().numpy()
+    none = baked.character.targets[:0]
+    return replace(baked.character, vertices=vertices, targets=none, clips=(), rigged=False)

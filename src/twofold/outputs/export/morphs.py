@@ -1,0 +1,176 @@
+"""The pose-dependent branch as morph targets: the full surface of each frame, pulled back through the exported rig."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from twofold.body.skeleton import PosedBody
+from twofold.geometry.rotations import rigid_inverse
+from twofold.geometry.surfaces import vertex_normals
+from twofold.methods.base import Avatar, PosedAvatar
+
+LIMIT = 0.03
+"""How far the surface is looked for along a normal, metres."""
+_OFF = 0.002
+_MISPLACED = 0.04
+LEFT_OUT = 5
+"""Every so many frames one is left out, to measure how targets do on frames that they were not fitted to."""
+
+
+@dataclass(frozen=True)
+class PulledBack:
+    """One frame's surface, vertex by vertex.
+
+    Attributes:
+        displacement: what the exported skinning has to be given beside the rest vertices, rest space, metres.
+        posed: where that puts the vertices, world, metres.
+        canonical: the same points in canonical space, by the method's own map.
+        to_observation: takes canonical gradients to observation space.
+        to_rest: takes normals of observation space to the rest pose, not of unit length.
+        found: where there is a surface close by that the map takes to the same part of the body; the displacement is
+            zero elsewhere.
+    """
+
+    displacement: Float[Tensor, "V 3"]
+    posed: Float[Tensor, "V 3"]
+    canonical: Float[Tensor, "V 3"]
+    to_observation: Float[Tensor, "V 3 3"]
+    to_rest: Float[Tensor, "V 3 3"]
+    found: Bool[Tensor, "V"]
+
+
+@dataclass(frozen=True)
+class Skin:
+    """A surface in the T-pose with its skinning, and the same surface in canonical space.
+
+    Attributes:
+        vertices: rest pose, metres.
+        canonical: canonical space, metres.
+        faces: triangles.
+        weights: skinning weights.
+        rest: the body in the T-pose.
+    """
+
+    vertices: Float[Tensor, "V 3"]
+    canonical: Float[Tensor, "V 3"]
+    faces: Int[Tensor, "F 3"]
+    weights: Float[Tensor, "V 24"]
+    rest: PosedBody
+
+    def transforms(self, body: PosedBody) -> Float[Tensor, "V 3 4"]:
+        """Rest pose to world, at each vertex, with the body in another pose."""
+        from_rest = body.bones @ rigid_inverse(self.rest.bones)
+        return (self.weights @ from_rest[:, :3].flatten(1)).unflatten(-1, (3, 4))
+
+
+@torch.no_grad()
+def pull_back(avatar: Avatar, posed: PosedAvatar, skin: Skin, branch: str = "full") -> PulledBack:
+    """The avatar's surface in a pose as a displacement of the rest vertices before skinning.
+
+    Each skinned vertex moves along its normal to where the signed distance, asked in observation space, is zero (two
+    secant steps); the inverse of its own skinning takes it back to the rest pose. So the result holds what the
+    pose-dependent branch does, and what the exported skinning does otherwise than the method's own map.
+
+    Args:
+        avatar: whose field.
+        posed: its pose.
+        skin: the exported surface.
+        branch: "full" or "base".
+    """
+    rows = skin.transforms(posed.body)
+    start = (rows[..., :3] * skin.vertices[:, None]).sum(-1) + rows[..., 3]
+    normals = vertex_normals(start, skin.faces)
+
+    def field_at(shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        x, to_observation = avatar.to_canonical(start + shift[:, None] * normals, posed)
+        return avatar.level(x, posed, branch), x, to_observation
+
+    first, _, _ = field_at(torch.zeros_like(start[:, 0]))
+    once = (-first).clamp(-LIMIT, LIMIT)
+    second, _, _ = field_at(once)
+    moved = once.abs() > 1e-4
+    slope = torch.where(moved, (second - first) / torch.where(moved, once, 1.0), 1.0).clamp(0.4, 2.5)
+    shift = (once - (second / slope).clamp(-0.01, 0.01)).clamp(-LIMIT, LIMIT)
+    left, x, to_observation = field_at(shift)
+    found = (left.abs() < _OFF) & (shift.abs() < LIMIT) & ((x - skin.canonical).norm(dim=-1) < _MISPLACED)
+    shift = torch.where(found, shift, 0.0)
+    linear = rows[..., :3]
+    displacement = torch.linalg.solve(linear, shift[:, None] * normals)
+    return PulledBack(
+        displacement, start + shift[:, None] * normals, torch.where(found[:, None], x, skin.canonical),
+        to_observation, linear.transpose(-1, -2), found,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Morphs:
+    """A mean shape and how it changes: displacement of frame t = mean + sum_k weights[t, k] targets[k].
+
+    Attributes:
+        mean: metres.
+        targets: metres at weight 1.
+        weights: of the fitted frames; the largest of a target is 1.
+    """
+
+    mean: Float[Tensor, "V 3"]
+    targets: Float[Tensor, "M V 3"]
+    weights: Float[Tensor, "T M"]
+
+    def weights_of(self, displacements: Float[Tensor, "T V 3"]) -> Float[Tensor, "T M"]:
+        """Least-squares weights of displacements."""
+        if len(self.targets) == 0:
+            return displacements.new_zeros(len(displacements), 0)
+        basis, off = self.targets.flatten(1), (displacements - self.mean).flatten(1)
+        # Targets are orthogonal to each other, so that each weight stands alone.
+        return (off @ basis.T) / basis.square().sum(1)
+
+
+def fit_morphs(displacements: Float[Tensor, "T V 3"], found: Bool[Tensor, "T V"], count: int) -> Morphs:
+    """The mean over frames and its `count` leading changes (principal components).
+
+    Args:
+        displacements: of the frames, metres.
+        found: where they hold; elsewhere the mean of the other frames stands in.
+        count: at most so many targets.
+    """
+    known = found[..., None].to(displacements.dtype)
+    mean = (displacements * known).sum(0) / known.sum(0).clamp_min(1)
+    off = ((displacements - mean) * known).flatten(1)
+    count = min(count, len(off) - 1)
+    if count < 1:
+        none = displacements.new_zeros(0, *mean.shape)
+        return Morphs(mean, none, displacements.new_zeros(len(off), 0))
+    values, vectors = torch.linalg.eigh((off @ off.T).double())
+    vectors = vectors[:, values.argsort(descending=True)[:count]].to(off.dtype)
+    targets = vectors.T @ off
+    largest = vectors.abs().amax(0).clamp_min(1e-12)
+    kept = targets.norm(dim=-1) > 1e-9
+    targets, weights = (targets * largest[:, None])[kept], (vectors / largest)[:, kept]
+    return Morphs(mean, targets.unflatten(-1, mean.shape), weights)
+
+
+def morph_errors(displacements: Float[Tensor, "T V 3"], found: Bool[Tensor, "T V"], count: int) -> dict[str, float]:
+    """RMS distance (millimetres) of the mean shape, and of mean and targets, from the pulled-back surfaces.
+
+    Targets are fitted without every fifth frame. "fitted" are the frames they were fitted to, "left_out" the others,
+    whose weights are found by least squares.
+    """
+    left_out = torch.arange(len(displacements)) % LEFT_OUT == LEFT_OUT - 1
+    morphs = fit_morphs(displacements[~left_out], found[~left_out], count)
+    errors: dict[str, float] = {"targets": float(len(morphs.targets))}
+    for name, chosen in (("fitted", ~left_out), ("left_out", left_out)):
+        if not chosen.any():
+            continue
+        known = found[chosen][..., None]
+        off = torch.where(known, displacements[chosen] - morphs.mean, 0.0)
+        weights = morphs.weights_of(off + morphs.mean)
+        shown = torch.einsum("tm,mvc->tvc", weights, morphs.targets)
+        errors[f"{name}_without_mm"] = _rms_mm(off, known)
+        errors[f"{name}_with_mm"] = _rms_mm(off - shown, known)
+    return errors
+
+
+def _rms_mm(off: Tensor, known: Tensor) -> float:
+    return float((1000 * ((off * known).square().sum() / known.sum()).sqrt()).item())
