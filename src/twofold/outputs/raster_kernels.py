@@ -1,0 +1,126 @@
+"""Compiled loops that draw a mesh: nearest triangle behind every sample, and its colour."""
+
+import numpy as np
+
+from twofold.geometry.threads import compiled
+
+
+@compiled
+def project(vertices, rotation, translation, intrinsics, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
+    """Columns, rows and depths of points; `out` is V x 3."""
+    for v in range(len(vertices)):
+        x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+        a = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
+        b = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
+        c = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
+        if c > 1e-6:
+            out[v, 0] = (intrinsics[0, 0] * a + intrinsics[0, 1] * b) / c + intrinsics[0, 2]
+            out[v, 1] = intrinsics[1, 1] * b / c + intrinsics[1, 2]
+        out[v, 2] = c
+
+
+@compiled
+def nearest_faces(points, faces, inverse, face, first, end):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
+    """Fill rows first..end of the z-buffer: inverse depth, and which triangle; only those seen from outside count.
+
+    Args:
+        points: projected vertices, V x 3 (column, row, depth).
+        faces: triangles, counter-clockwise from outside.
+        inverse: h x w, zero where nothing is.
+        face: h x w, -1 where nothing is.
+        first: row to begin with.
+        end: row to end before.
+    """
+    width = inverse.shape[1]
+    for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        if points[i, 2] <= 1e-6 or points[j, 2] <= 1e-6 or points[k, 2] <= 1e-6:
+            continue
+        ax, ay, bx, by = points[i, 0], points[i, 1], points[j, 0], points[j, 1]
+        cx, cy = points[k, 0], points[k, 1]
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if area >= -1e-12:  # rows count downwards, so what faces the camera turns the other way
+            continue
+        top = max(first, int(np.ceil(min(ay, by, cy))))
+        bottom = min(end - 1, int(np.floor(max(ay, by, cy))))
+        left = max(0, int(np.ceil(min(ax, bx, cx))))
+        right = min(width - 1, int(np.floor(max(ax, bx, cx))))
+        if top > bottom or left > right:
+            continue
+        scale = 1 / area
+        da, db, dc = 1 / points[i, 2], 1 / points[j, 2], 1 / points[k, 2]
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                x, y = column - ax, row - ay
+                s = (x * (cy - ay) - y * (cx - ax)) * scale
+                t = (y * (bx - ax) - x * (by - ay)) * scale
+                if s < -1e-5 or t < -1e-5 or s + t > 1 + 1e-5:
+                    continue
+                depth = da + s * (db - da) + t * (dc - da)
+                if depth > inverse[row, column]:
+                    inverse[row, column] = depth
+                    face[row, column] = f
+
+
+@compiled
+def shade(  # type: ignore[no-untyped-def]  # noqa: ANN201
+    points, faces, face, corners, uv, texture, colors, light, factor, out, first, end  # noqa: ANN001
+):
+    """Mean colour and opacity of the samples in each pixel of rows first..end.
+
+    Args:
+        points: projected vertices.
+        faces: triangles.
+        face: which triangle each sample sees.
+        corners: the same triangles by corners of the atlas.
+        uv: of these, in texels.
+        texture: h x w x 3, or without texels where there is none.
+        colors: of the vertices, where there is no texture.
+        light: brightness of each vertex.
+        factor: samples along each side of a pixel.
+        out: h x w x 4, is written.
+        first: pixel row to begin with.
+        end: pixel row to end before.
+    """
+    height, width = texture.shape[0], texture.shape[1]
+    for row in range(first, end):
+        for column in range(out.shape[1]):
+            r = g = b = count = 0.0
+            for sample in range(factor * factor):
+                y, x = row * factor + sample // factor, column * factor + sample % factor
+                f = face[y, x]
+                if f < 0:
+                    continue
+                i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+                ax, ay = points[i, 0], points[i, 1]
+                bx, by, cx, cy = points[j, 0] - ax, points[j, 1] - ay, points[k, 0] - ax, points[k, 1] - ay
+                scale = 1 / (bx * cy - by * cx)
+                s = min(max(((x - ax) * cy - (y - ay) * cx) * scale, 0.0), 1.0)
+                t = min(max(((y - ay) * bx - (x - ax) * by) * scale, 0.0), 1.0 - s)
+                wa, wb, wc = (1 - s - t) / points[i, 2], s / points[j, 2], t / points[k, 2]
+                total = wa + wb + wc
+                wa, wb, wc = wa / total, wb / total, wc / total
+                bright = wa * light[i] + wb * light[j] + wc * light[k]
+                if height > 0:
+                    p, q, o = corners[f, 0], corners[f, 1], corners[f, 2]
+                    u = wa * uv[p, 0] + wb * uv[q, 0] + wc * uv[o, 0] - 0.5
+                    v = wa * uv[p, 1] + wb * uv[q, 1] + wc * uv[o, 1] - 0.5
+                    u, v = min(max(u, 0.0), width - 1.001), min(max(v, 0.0), height - 1.001)
+                    m, n = int(u), int(v)
+                    du, dv = u - m, v - n
+                    w00, w01, w10, w11 = (1 - du) * (1 - dv), du * (1 - dv), (1 - du) * dv, du * dv
+                    bright /= 255
+                    r += bright * (w00 * texture[n, m, 0] + w01 * texture[n, m + 1, 0]
+                                   + w10 * texture[n + 1, m, 0] + w11 * texture[n + 1, m + 1, 0])  # fmt: skip
+                    g += bright * (w00 * texture[n, m, 1] + w01 * texture[n, m + 1, 1]
+                                   + w10 * texture[n + 1, m, 1] + w11 * texture[n + 1, m + 1, 1])  # fmt: skip
+                    b += bright * (w00 * texture[n, m, 2] + w01 * texture[n, m + 1, 2]
+                                   + w10 * texture[n + 1, m, 2] + w11 * texture[n + 1, m + 1, 2])  # fmt: skip
+                else:
+                    r += bright * (wa * colors[i, 0] + wb * colors[j, 0] + wc * colors[k, 0])
+                    g += bright * (wa * colors[i, 1] + wb * colors[j, 1] + wc * colors[k, 1])
+                    b += bright * (wa * colors[i, 2] + wb * colors[j, 2] + wc * colors[k, 2])
+                count += 1
+            samples = factor * factor
+            out[row, column, 0], out[row, column, 1], out[row, column, 2] = r / samples, g / samples, b / samples
+            out[row, column, 3] = count / samples
