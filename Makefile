@@ -51,12 +51,12 @@ clean: ## Remove what the targets made, .venv included
 
 $(VENV)/.ready-studio: pyproject.toml constraints.txt | $(VENV)/.made
 	@echo "Setting up $(VENV): downloads some 500 MB, once."
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio,export]'
 	@touch $@
 
 $(VENV)/.ready-all: pyproject.toml constraints.txt | $(VENV)/.made
 	@echo "Setting up $(VENV) with all tools: downloads some 900 MB, once."
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio,prepare,test,docs,dev]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio,prepare,export,test,docs,dev]'
 	@touch $@ $(VENV)/.ready-studio
 
 $(VENV)/.made:

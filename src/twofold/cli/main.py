@@ -1,4 +1,6 @@
-"""The command line: `twofold studio`, `import`, `prepare`, `check`, `train`, `render`, `motion`, `evaluate`, `demo`.
+"""The command line: `twofold studio`, `import`, `prepare`, `check`, `train`, `render`, `evaluate`, `export`, `demo`.
+"""The command line: `twofold studio`, `import`, `prepare`, `check`, `train`, `render`, `motion`, `evaluate`, `export`,
+`demo`.
 
 What a command needs is imported when it runs, so that `--help` answers at once.
 """
@@ -17,6 +19,7 @@ import tyro
 from twofold import __version__
 from twofold.cli.captures import check, import_capture, prepare, studio
 from twofold.cli.console import ALONE, bar, console, say, within
+from twofold.cli.exports import export
 from twofold.cli.motions import NO_MOTION, MotionView, motion, render_motion
 from twofold.cli.streams import streams_that_never_fail
 from twofold.errors import TwofoldError
@@ -235,6 +238,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "render": render,
     "evaluate": evaluate,
     "motion": motion,
+    "export": export,
 }
 
 

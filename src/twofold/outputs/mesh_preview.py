@@ -7,7 +7,7 @@ from torch import Tensor
 
 from twofold.geometry.cameras import Camera
 from twofold.geometry.raster import supersampled
-from twofold.geometry.threads import in_parts
+from twofold.kernels.parallel import in_parts
 from twofold.outputs.export.character import Character, normals_of
 from twofold.outputs.raster_kernels import nearest_faces, project, shade
 
@@ -48,9 +48,7 @@ def draw_mesh(
     light = _headlight(own, character, camera) if headlight else np.ones(len(own), dtype=np.float32)
     image = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
     given = (points, faces, face, corners, uv, texture, np.ascontiguousarray(character.colors, dtype=np.float32))
-    in_parts(
-        camera.height, lambda first, end: shade(*given, light, samples, image, first, end), least=16
-    )
+    in_parts(camera.height, lambda first, end: shade(*given, light, samples, image, first, end), least=16)
     image[..., :3] += (1 - image[..., 3:]) * background.astype(np.float32)
     return image
 

@@ -1,12 +1,14 @@
 """Compiled loops that draw a mesh: nearest triangle behind every sample, and its colour."""
 
+# pyright: reportMissingParameterType=false
+
 import numpy as np
 
-from twofold.geometry.threads import compiled
+from twofold.kernels.parallel import compiled
 
 
 @compiled
-def project(vertices, rotation, translation, intrinsics, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
+def project(vertices, rotation, translation, intrinsics, out):  # noqa: ANN001, ANN201
     """Columns, rows and depths of points; `out` is V x 3."""
     for v in range(len(vertices)):
         x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
@@ -20,7 +22,7 @@ def project(vertices, rotation, translation, intrinsics, out):  # type: ignore[n
 
 
 @compiled
-def nearest_faces(points, faces, inverse, face, first, end):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
+def nearest_faces(points, faces, inverse, face, first, end):  # noqa: ANN001, ANN201
     """Fill rows first..end of the z-buffer: inverse depth, and which triangle; only those seen from outside count.
 
     Args:
@@ -63,9 +65,7 @@ def nearest_faces(points, faces, inverse, face, first, end):  # type: ignore[no-
 
 
 @compiled
-def shade(  # type: ignore[no-untyped-def]  # noqa: ANN201
-    points, faces, face, corners, uv, texture, colors, light, factor, out, first, end  # noqa: ANN001
-):
+def shade(points, faces, face, corners, uv, texture, colors, light, factor, out, first, end):  # noqa: ANN001, ANN201
     """Mean colour and opacity of the samples in each pixel of rows first..end.
 
     Args:

@@ -90,9 +90,7 @@ def tangents(
     """
     own = vertices[atlas.vertex]
     a, b, c = (own[atlas.faces[:, corner]] for corner in range(3))
-    (du1, dv1), (du2, dv2) = (
-        (atlas.uv[atlas.faces[:, corner]] - atlas.uv[atlas.faces[:, 0]]).T for corner in (1, 2)
-    )
+    (du1, dv1), (du2, dv2) = ((atlas.uv[atlas.faces[:, corner]] - atlas.uv[atlas.faces[:, 0]]).T for corner in (1, 2))
     area = du1 * dv2 - du2 * dv1
     sign = np.sign(area)[:, None]
     along_u = sign * ((b - a) * dv2[:, None] - (c - a) * dv1[:, None])
@@ -106,7 +104,9 @@ def tangents(
     # Where triangles cancel or have no area, any direction along the surface serves.
     other = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]))
     length = np.linalg.norm(tangent, axis=1, keepdims=True)
-    tangent = np.where(length > 1e-9, tangent / np.maximum(length, 1e-9), other / np.linalg.norm(other, axis=1)[:, None])
+    tangent = np.where(
+        length > 1e-9, tangent / np.maximum(length, 1e-9), other / np.linalg.norm(other, axis=1)[:, None]
+    )
     handed = np.where((np.cross(normal, tangent) * summed[1]).sum(1) < 0, -1.0, 1.0)
     return np.concatenate([tangent, handed[:, None]], 1).astype(np.float32)
 

@@ -1,12 +1,14 @@
 """Compiled loops over the texels of an atlas."""
 
+# pyright: reportMissingParameterType=false
+
 import numpy as np
 
 from twofold.kernels.parallel import compiled
 
 
 @compiled
-def paint(image, covered, uv, faces, table, segments, values):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
+def paint(image, covered, uv, faces, table, segments, values):  # noqa: ANN001, ANN201
     """Write at each texel that a triangle covers the values of the lattice there.
 
     Args:

@@ -14,8 +14,8 @@ from twofold.errors import TwofoldError
 from twofold.geometry.surfaces import face_areas
 from twofold.methods.base import Avatar, PosedAvatar
 from twofold.outputs.export.morphs import PulledBack, Skin, fit_morphs, morph_errors, pull_back
-from twofold.outputs.export.rig import to_rest, transfer_weights
 from twofold.outputs.export.repair import as_tensors, decimate, is_watertight, solid
+from twofold.outputs.export.rig import to_rest, transfer_weights
 from twofold.outputs.mesh import extract_surface, keep_largest
 
 Progress = Callable[[float, str], None]
@@ -209,7 +209,7 @@ def bake_normals(
     branch: str,
     chunk: int = 65_536,
 ) -> Float[Tensor, "N 3"]:
-    """Unit normals of the rest pose from the gradient of the signed distance, the mean over poses; see `bake_colors`."""
+    """Unit normals of the rest pose from the gradient of the signed distance, mean over poses; see `bake_colors`."""
     total: Tensor | None = None
     for posed, back in shown:
         x, matrix, to_rest_ = (interpolate(t) for t in (back.canonical, back.to_observation, back.to_rest))

@@ -1,6 +1,7 @@
 """Motions of a character: from training frames or from any poses, upright and on the ground."""
 
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -23,28 +24,53 @@ def capture_clip(baked: Baked, name: str = "capture") -> Clip:
     return _clip(baked, name, training_poses(baked.capture), np.array(times) / baked.capture.fps)
 
 
-def motion_clip(
-    baked: Baked, name: str, poses: Float[Tensor, "T 24 3"], translations: Float[Tensor, "T 3"], fps: float
-) -> Clip:
-    """Any motion of the body, with the weights that the field gives the morph targets in its poses."""
+@runtime_checkable
+class Motion(Protocol):
+    """A pose sequence: axis-angle rotations (radians), SMPL's translations (metres), y up, evenly spaced in time."""
+
+    @property
+    def name(self) -> str:
+        """For titles."""
+        ...
+
+    @property
+    def poses(self) -> Float[Tensor, "T 24 3"]:
+        """Root first."""
+        ...
+
+    @property
+    def translations(self) -> Float[Tensor, "T 3"]:
+        """Added after the root has turned about its rest joint."""
+        ...
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        ...
+
+
+def motion_clip(baked: Baked, motion: Motion) -> Clip:
+    """Any motion of the body as a clip, with the weights that the field gives the morph targets in its poses."""
+    poses, translations = motion.poses.float(), motion.translations.float()
     frames = [Pose(pose, place, None) for pose, place in zip(poses, translations, strict=True)]
-    return _clip(baked, name, frames, np.arange(len(frames)) / fps)
+    return _clip(baked, motion.name, frames, np.arange(len(frames)) / motion.fps)
 
 
 @torch.no_grad()
 def _clip(baked: Baked, name: str, frames: Sequence[Pose], times: np.ndarray) -> Clip:
     shape, avatar = baked.shape, baked.avatar
     fitted = {frame.frame_index: row for row, frame in enumerate(shape.frames) if frame.frame_index is not None}
-    known = [frame.frame_index in fitted for frame in frames]
-    asked = set(spread([index for index, there in enumerate(known) if not there], WEIGHED))
+    row_of = [None if frame.frame_index is None else fitted.get(frame.frame_index) for frame in frames]
+    asked = set(spread([index for index, row in enumerate(row_of) if row is None], WEIGHED))
     poses, places = [], []
     weights: dict[int, np.ndarray] = {}
     for index, frame in enumerate(frames):
         posed = frame.of(avatar)
         poses.append(posed.body.pose.cpu().numpy())
         places.append((posed.body.joints[0] - shape.skin.rest.joints[0]).cpu().numpy())
-        if known[index]:
-            weights[index] = shape.weights[fitted[frame.frame_index]].cpu().numpy()
+        row = row_of[index]
+        if row is not None:
+            weights[index] = shape.weights[row].cpu().numpy()
         elif index in asked:
             weights[index] = shape.weights_at(avatar, posed, baked.config.branch).cpu().numpy()
     rows, given = np.arange(len(frames)), sorted(weights)

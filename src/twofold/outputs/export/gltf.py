@@ -96,7 +96,7 @@ def gltf_document(character: Character, options: ExportOptions) -> tuple[dict[st
         "meshes": [_mesh(character, chunk, lift, options.morph_normals)],
     }
     if character.texture is not None:
-        images = [character.texture, *([character.normal_map] if _has_normal_map(character) else [])]
+        images = [character.texture, *_normal_maps(character)]
         document |= {
             "images": [_image(chunk, image, options.image) for image in images],
             "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
@@ -116,8 +116,9 @@ def gltf_document(character: Character, options: ExportOptions) -> tuple[dict[st
     return document, chunk
 
 
-def _has_normal_map(character: Character) -> bool:
-    return character.normal_map is not None and not character.lit
+def _normal_maps(character: Character) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """The normal map, where viewers are to light the surface; or nothing."""
+    return [] if character.normal_map is None or character.lit else [character.normal_map]
 
 
 def _material(character: Character) -> dict[str, Any]:
@@ -125,7 +126,7 @@ def _material(character: Character) -> dict[str, Any]:
     material: dict[str, Any] = {"name": "surface", "pbrMetallicRoughness": surface}
     if character.texture is not None:
         surface["baseColorTexture"] = {"index": 0}
-        if _has_normal_map(character):
+        if _normal_maps(character):
             material["normalTexture"] = {"index": 1}
     if character.lit:
         material["extensions"] = {"KHR_materials_unlit": {}}
@@ -143,7 +144,7 @@ def _mesh(character: Character, chunk: BinaryChunk, lift: np.ndarray, morph_norm
     }
     if atlas is not None:
         attributes["TEXCOORD_0"] = chunk.accessor(atlas.uv.astype(np.float32), _ARRAY)
-        if _has_normal_map(character):
+        if _normal_maps(character):
             attributes["TANGENT"] = chunk.accessor(tangents(atlas, character.vertices, normals), _ARRAY)
     else:
         attributes["COLOR_0"] = chunk.accessor(_linear_colors(character.colors), _ARRAY, normalized=True)

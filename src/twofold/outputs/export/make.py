@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from twofold.capture.types import Capture, Frame, spread
@@ -16,6 +16,7 @@ from twofold.outputs.export.bake import BakeConfig, BakedShape, Pose, Progress, 
 from twofold.outputs.export.character import Character, normals_of
 from twofold.outputs.export.lattice import TriangleLattice, build_lattice, segments_for
 from twofold.outputs.export.morphs import PulledBack, pull_back
+from twofold.outputs.export.observed import observed_share
 
 QUERIES = 3_000_000
 """Points that the field is asked for the colours of one character, over all poses."""
@@ -115,6 +116,7 @@ def bake(
         clips=(),
         colors=colors[: len(vertices)],
         lit=lit,
+        observed=_observed(capture, shape, faces),
     )
     if config.texture:
         progress(0.7, "atlas")
@@ -128,6 +130,13 @@ def bake(
         character = replace(character, atlas=atlas, texture=as_bytes_image(texture), normal_map=normals)
     progress(1.0, "")
     return Baked(avatar, capture, config, shape, character)
+
+
+def _observed(capture: Capture, shape: BakedShape, faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V"]:
+    averaged = spread(shape.frames, len(shape.shown))
+    posed = {frame.frame_index: back.posed for frame, (_, back) in zip(averaged, shape.shown, strict=True)}
+    views = [(f.camera, posed[f.time].cpu().numpy()) for f in capture.train if f.time in posed]
+    return observed_share(faces, views)
 
 
 def normal_map(

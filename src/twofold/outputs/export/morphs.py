@@ -146,7 +146,8 @@ def fit_morphs(displacements: Float[Tensor, "T V 3"], found: Bool[Tensor, "T V"]
     vectors = vectors[:, values.argsort(descending=True)[:count]].to(off.dtype)
     targets = vectors.T @ off
     largest = vectors.abs().amax(0).clamp_min(1e-12)
-    kept = targets.norm(dim=-1) > 1e-9
+    size = targets.norm(dim=-1)
+    kept = size > 1e-4 * size.max()  # what is smaller is rounding
     targets, weights = (targets * largest[:, None])[kept], (vectors / largest)[:, kept]
     return Morphs(mean, targets.unflatten(-1, mean.shape), weights)
 

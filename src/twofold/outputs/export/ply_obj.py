@@ -64,7 +64,5 @@ def write_obj(character: Character, path: Path, options: ExportOptions) -> None:
         lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in own]
     else:
         flat = (atlas.faces + 1).tolist()
-        lines += [
-            f"f {a}/{p}/{a} {b}/{q}/{b} {c}/{r}/{c}" for (a, b, c), (p, q, r) in zip(own, flat, strict=True)
-        ]
+        lines += [f"f {a}/{p}/{a} {b}/{q}/{b} {c}/{r}/{c}" for (a, b, c), (p, q, r) in zip(own, flat, strict=True)]
     write_bytes(path, ("\n".join(lines) + "\n").encode())

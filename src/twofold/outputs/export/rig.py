@@ -30,6 +30,8 @@ HUMANOID = {
 }  # fmt: skip
 """VRM 1.0's humanoid bone for each joint that has one; SMPL's hand joints, in the palms, have none."""
 
+_PALMS = {"left_hand": "leftPalm", "right_hand": "rightPalm"}
+
 _MIXAMO = {
     "pelvis": "Hips", "spine1": "Spine", "spine2": "Spine1", "spine3": "Spine2", "neck": "Neck", "head": "Head",
     "left_hip": "LeftUpLeg", "left_knee": "LeftLeg", "left_ankle": "LeftFoot", "left_foot": "LeftToeBase",
@@ -47,13 +49,8 @@ def joint_names(rig: RigNames) -> tuple[str, ...]:
     if rig == "smpl":
         return JOINT_NAMES
     if rig == "vrm":
-        return tuple(HUMANOID.get(name, _camel(name)) for name in JOINT_NAMES)
+        return tuple(HUMANOID.get(name, _PALMS.get(name, name)) for name in JOINT_NAMES)
     return tuple(f"mixamorig:{_mixamo(name)}" for name in JOINT_NAMES)
-
-
-def _camel(name: str) -> str:
-    first, *more = name.split("_")
-    return first + "".join(word.title() for word in more)
 
 
 def _mixamo(name: str) -> str:
@@ -95,9 +92,7 @@ def keep_largest_weights(weights: Float[Tensor, "V J"], count: int = INFLUENCES)
     return kept / kept.sum(-1, keepdim=True)
 
 
-def to_rest(
-    vertices: Float[Tensor, "V 3"], weights: Float[Tensor, "V 24"], rest: PosedBody
-) -> Float[Tensor, "V 3"]:
+def to_rest(vertices: Float[Tensor, "V 3"], weights: Float[Tensor, "V 24"], rest: PosedBody) -> Float[Tensor, "V 3"]:
     """Canonical vertices in the T-pose: where linear blend skinning takes them from to canonical space.
 
     Args:

@@ -1,0 +1,147 @@
+"""`twofold export`: the files of an avatar, and a record of what is in them."""
+
+import importlib.util
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from twofold.capture.types import Capture
+from twofold.errors import TwofoldError
+from twofold.files import plain_errors, write_json
+from twofold.methods.base import Avatar
+from twofold.outputs.export.bake import BakeConfig, Progress
+from twofold.outputs.export.character import Character, Clip
+from twofold.outputs.export.clips import Motion, capture_clip, grounded, motion_clip, turned, upright
+from twofold.outputs.export.formats import EXPORTERS
+from twofold.outputs.export.make import Baked, bake, frame_at, still
+from twofold.outputs.export.options import ExportOptions
+
+RECORD = "export.json"
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """What is to be exported.
+
+    Attributes:
+        formats: keys of `EXPORTERS`.
+        config: of the character.
+        color: "full", "base" or a frame's index; see `bake`.
+        frame: a frame in whose pose a mesh without a rig is written; None for the rigged character.
+        capture_motion: whether the capture's own motion is among the clips.
+        motions: further motions.
+        options: of the files.
+    """
+
+    formats: tuple[str, ...] = ("glb",)
+    config: BakeConfig = BakeConfig()
+    color: str | int = "full"
+    frame: int | None = None
+    capture_motion: bool = True
+    motions: tuple[Motion, ...] = ()
+    options: ExportOptions = ExportOptions()
+
+
+def require_exportable(request: ExportRequest, capture: Capture) -> None:
+    """Refuses, before anything is baked, what would fail afterwards.
+
+    Raises:
+        TwofoldError: formats and options exclude each other, a frame does not exist, or a package is missing.
+    """
+    for name in request.formats:
+        holds = EXPORTERS[name].holds
+        if request.frame is not None and holds == "rig":
+            raise TwofoldError(
+                f"--frame writes a mesh without a rig, which {name} files need; leave --frame or {name}."
+            )
+        if name == "bvh" and not request.capture_motion and not request.motions:
+            raise TwofoldError("A bvh file holds a motion; leave --motion none out, or name a motion.")
+    for frame in (request.frame, request.color):
+        if isinstance(frame, int):
+            frame_at(capture, frame)
+    needed = ["fast_simplification", *(["xatlas"] if request.config.texture else [])]
+    missing = [name.replace("_", "-") for name in needed if importlib.util.find_spec(name) is None]
+    if missing:
+        raise TwofoldError(f"Exporting needs {' and '.join(missing)}; run pip install 'twofold[export]'.")
+
+
+def export(
+    avatar: Avatar,
+    capture: Capture,
+    folder: Path,
+    request: ExportRequest,
+    progress: Progress = lambda _done, _note: None,
+) -> list[Path]:
+    """Writes an avatar's files into a folder, and `export.json`, which says what is in them.
+
+    Raises:
+        TwofoldError: see `require_exportable`; the avatar has no surface; the disk refuses.
+    """
+    require_exportable(request, capture)
+    with plain_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    start = time.monotonic()
+    options = request.options
+    baked = bake(
+        avatar, capture, request.config, request.color, options.name, lambda done, note: progress(0.85 * done, note)
+    )
+    seconds = time.monotonic() - start
+    character = baked.character
+    stem = "avatar" if request.frame is None else f"avatar_{request.frame:04d}"
+    if request.frame is not None:
+        rotation = upright(capture)
+        character = still(baked, request.frame, lambda x: x @ rotation.T.to(x))
+    elif any(EXPORTERS[name].holds != "mesh" for name in request.formats):
+        progress(0.88, "motions")
+        character = replace(character, clips=tuple(_clips(baked, request.capture_motion, request.motions)))
+    written: list[Path] = []
+    for name in request.formats:
+        progress(0.95, name)
+        own = standing(character) if EXPORTERS[name].holds == "mesh" and character.rigged else character
+        EXPORTERS[name].write(own, folder / f"{stem}.{name}", options)
+        written.append(folder / f"{stem}.{name}")
+    write_json(folder / RECORD, record(baked, character, written, seconds))
+    progress(1.0, "")
+    return written
+
+
+def _clips(baked: Baked, capture_motion: bool, motions: Sequence[Motion]) -> list[Clip]:
+    character, pelvis = baked.character, baked.character.joints[0]
+    clips: list[Clip] = []
+    if capture_motion:
+        clips.append(grounded(turned(capture_clip(baked), upright(baked.capture), pelvis), character))
+    for motion in motions:
+        clips.append(grounded(motion_clip(baked, motion), character))
+    return clips
+
+
+def standing(character: Character) -> Character:
+    """The mesh in the rest pose without its rig, soles at y = 0."""
+    lifted = character.vertices - np.array([0, character.ground, 0], dtype=character.vertices.dtype)
+    return replace(character, vertices=lifted, targets=character.targets[:0], clips=(), rigged=False)
+
+
+def record(baked: Baked, character: Character, written: Sequence[Path], seconds: float) -> dict[str, object]:
+    """What an export holds and how good it is, for `export.json` and the report."""
+    observed = baked.character.observed
+    return {
+        "files": {path.name: path.stat().st_size for path in written},
+        "triangles": len(character.faces),
+        "vertices": len(character.vertices),
+        "watertight": baked.shape.watertight,
+        "morph_targets": len(character.targets),
+        "morph_errors_mm": baked.shape.errors,
+        "texture": 0 if character.texture is None else len(character.texture),
+        "lit": character.lit,
+        "clips": {clip.name: len(clip.times) for clip in character.clips},
+        "observed_share": None if observed is None else float((observed > 0).mean()),
+        "bake_seconds": round(seconds, 1),
+        "about": {
+            "morph_errors_mm": "RMS distance from the full surface of each frame pulled back through the skinning; "
+            "targets fitted without every fifth frame, which are the left-out ones",
+            "observed_share": "share of the vertices that at least one of the sampled training images shows",
+        },
+    }
