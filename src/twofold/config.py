@@ -97,6 +97,16 @@ def describe(config: object) -> list[str]:
     return [f"{left:<{width}}  {text}" if text else left for left, text in rows]
 
 
+def require(holds: bool, wanted: str) -> None:
+    """Says what was wanted where it does not hold.
+
+    Raises:
+        ValueError: it does not.
+    """
+    if not holds:
+        raise ValueError(wanted)
+
+
 def require_within(config: object, **limits: tuple[int | float, int | float]) -> None:
     """Refuses settings outside their limits (minimum, maximum); None passes, each element of a list is checked.
 

@@ -58,11 +58,11 @@ def export(
     from twofold.outputs.export.options import ExportOptions
     from twofold.outputs.export.write import ExportRequest, require_exportable
     from twofold.outputs.export.write import export as write
-    from twofold.training.run import choose_device, find_capture, load, require_same
+    from twofold.training.run import choose_device, find_capture, load, read_recipe, require_same
 
     within(faces=(faces, 500, 2_000_000), texture=(texture, 64, 8192), morphs=(morphs, 0, 16))
-    where, source = choose_device(device), find_capture(run, capture)
-    read = read_capture(source)
+    read_recipe(run)
+    where, read = choose_device(device), read_capture(find_capture(run, capture))
     require_same(run, read, motion=True)
     request = ExportRequest(
         tuple(dict.fromkeys(format)),

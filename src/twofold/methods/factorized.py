@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from twofold.body.skeleton import PosedBody, ShapedBody, pose_body, shape_body
-from twofold.config import require_within
+from twofold.config import require, require_within
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.deform.skinning import (
     normal_matrices,
@@ -92,10 +92,10 @@ class FactorizedConfig(MethodConfig):
             outlier_distance=(0.001, 10),
             beta=(0, 10),
         )
-        _require(0 < self.beta_floor < self.beta, f"beta_floor should lie between 0 and beta={self.beta}")
+        require(0 < self.beta_floor < self.beta, f"beta_floor should lie between 0 and beta={self.beta}")
         if isinstance(self.field, GridFieldConfig) and isinstance(self.sampler, ShellSampler):
             within = self.sampler.radius <= self.field.radius
-            _require(within, f"sampler.radius should be at most field.radius={self.field.radius}, where features end")
+            require(within, f"sampler.radius should be at most field.radius={self.field.radius}, where features end")
 
     def build(self, subject: Subject, seed: int = 0) -> "FactorizedAvatar":
         """An untrained avatar of a subject."""
@@ -161,8 +161,8 @@ class FactorizedAvatar(Avatar):
 
     def compiled(self) -> AbstractContextManager[bool]:
         """See `Avatar.compiled`. Feature grids have compiled loops of their own."""
-        dense = isinstance(self.field, FactorizedField)
-        return compiled_methods(self.field, ("forward", "sdf", "distance_and_gradient") if dense else ())
+        dense = ("forward", "sdf", "distance_and_gradient") if isinstance(self.field, FactorizedField) else ()
+        return compiled_methods(self.field, dense)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The field's groups, "beta" and "pose"."""
@@ -310,13 +310,14 @@ class FactorizedAvatar(Avatar):
         def distance(x_canonical: Tensor) -> Tensor:
             return self.field.sdf(x_canonical, posed.condition)
 
-        weigh = self._weigh
         if isinstance(sampler, ErrorBoundedSampler):
             scale = self.scale if sampler.units == "scene" else 1.0
-            placed = place_error_bounded(sampler, rays, posed, weigh, limit, generator, distance, self.beta, scale)
+            placed = place_error_bounded(
+                sampler, rays, posed, self._weigh, limit, generator, distance, self.beta, scale
+            )
             shading = self.config.outliers_in_shading and generator is None
             return replace(placed, outlier=placed.outlier & shading)
-        placed = place_in_shell(sampler, rays, posed, k, weigh, min(sampler.radius, limit), generator)
+        placed = place_in_shell(sampler, rays, posed, k, self._weigh, min(sampler.radius, limit), generator)
         home = self._canonical_shell(sampler, posed) if sampler.stray > 0 else None
         table = None if self.training or generator is not None else lambda count: self._table(count, posed, distance)
         return that_count(sampler, placed, rays, posed, home, distance, self.beta, table)
@@ -326,8 +327,7 @@ class FactorizedAvatar(Avatar):
 
     def _canonical_shell(self, sampler: ShellSampler, posed: PosedAvatar) -> Shell:
         if self._home is None or self._home.vertices.device != self.device:
-            points, faces = self.canonical_points, posed.body.faces
-            self._home = build_shell(points, faces, sampler.radius, sampler.voxel)
+            self._home = build_shell(self.canonical_points, posed.body.faces, sampler.radius, sampler.voxel)
         return self._home
 
     def _table(self, samples: int, posed: PosedAvatar, distance: Distance) -> DistanceTable | None:
@@ -379,11 +379,10 @@ class FactorizedAvatar(Avatar):
         to_observation: Float[Tensor, "S 3 3"] | None = None, branch: str = "full", lit: bool = True,
     ) -> FieldOutput:  # fmt: skip
         """See `Avatar.query`."""
-        _require(branch in ("full", "base"), f'branch is "full" or "base"; it is {branch!r}')
-        if isinstance(self.field, GridField) and not lit:
-            answer = self.field.unlit(x_canonical, posed.condition)
-        else:
-            answer = self.field(x_canonical, posed.condition, to_observation)
+        require(branch in ("full", "base"), f'branch is "full" or "base"; it is {branch!r}')
+        plain = self.field.unlit if isinstance(self.field, GridField) and not lit else None
+        x, pose = x_canonical, posed.condition
+        answer = plain(x, pose) if plain else self.field(x, pose, to_observation)
         return answer if branch == "full" else answer.base or answer
 
     def to_canonical(
@@ -392,11 +391,6 @@ class FactorizedAvatar(Avatar):
         """See `Avatar.to_canonical`; the nearest vertices are exact, `render` takes them from the shell's lists."""
         distances, nearest = nearest_vertices(x_posed, posed.body.vertices, posed.neighbours)
         return self._carried(x_posed, nearest, self._weigh(distances.square()), posed)
-
-
-def _require(holds: bool, wanted: str) -> None:
-    if not holds:
-        raise ValueError(wanted)
 
 
 _TABLE_PAYS = 150_000
