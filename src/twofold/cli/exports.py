@@ -1,12 +1,18 @@
 """`twofold export`: an avatar as files for other programs."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from twofold.cli.console import bar, say, within
 from twofold.errors import TwofoldError
+
+if TYPE_CHECKING:
+    from twofold.body.motion import Motion
+    from twofold.capture.types import Capture
+    from twofold.methods.base import Avatar
 
 Formats = Literal["glb", "vrm", "ply", "obj", "bvh"]
 
@@ -17,7 +23,7 @@ def export(
     out: Path | None = None,
     faces: int = 40_000,
     frame: int | None = None,
-    motion: Literal["capture", "none"] = "capture",
+    motion: tuple[str, ...] = ("capture",),
     branch: Literal["full", "base"] = "full",
     color: str = "full",
     lit: bool = False,
@@ -39,7 +45,7 @@ def export(
         out: Folder for the files; by default RUN/exports.
         faces: About so many triangles, 500 to 2,000,000.
         frame: Write the mesh as it stands in this frame of the capture, without a rig.
-        motion: Animation of a rigged character: the capture's own, or none.
+        motion: Animations of the character: capture, none, .bvh or .npz files, walk, turn, dance, range-of-motion.
         branch: Surface of the full field, or of the base branch.
         color: full (mean over training poses), base (base branch), or pose:N (the full field in the pose of frame N).
         lit: Keep the capture's light in the colours, where the method could leave it out.
@@ -67,15 +73,27 @@ def export(
     request = ExportRequest(
         tuple(dict.fromkeys(format)),
         BakeConfig(faces, branch, morphs, texture=0 if vertex_colors else texture, lit=lit),
-        _color(color), frame, motion == "capture", (), ExportOptions(rig, name, author, image),
+        _color(color), frame, "capture" in motion, (), ExportOptions(rig, name, author, image),
     )  # fmt: skip
-    require_exportable(request, read)
     avatar, _ = load(run, where)
+    request = replace(request, motions=_motions(avatar, [word for word in motion if word not in _OWN], read))
+    require_exportable(request, read)
     folder = out or run / "exports"
     with bar("Exporting") as show:
         written = write(avatar, read, folder, request, show)
     names = ", ".join(path.name for path in written)
     say(f"{names} in {folder}.", "open it in Blender, three.js or a game engine; see docs/export.md")
+
+
+_OWN = ("capture", "none")
+
+
+def _motions(avatar: "Avatar", words: list[str], capture: "Capture") -> "tuple[Motion, ...]":
+    from twofold.body.motion_files import MotionOptions, read_motion
+    from twofold.outputs.motion_video import rest_body
+
+    body = rest_body(avatar)
+    return tuple(read_motion(word, body, MotionOptions(), capture.body).motion for word in words)
 
 
 def _color(word: str) -> str | int:

@@ -1,6 +1,4 @@
-"""The command line: `twofold studio`, `import`, `prepare`, `check`, `train`, `render`, `evaluate`, `export`, `demo`.
-"""The command line: `twofold studio`, `import`, `prepare`, `check`, `train`, `render`, `motion`, `evaluate`, `export`,
-`demo`.
+"""The command line: `twofold studio`, `train`, `render` and the other commands of `COMMANDS`.
 
 What a command needs is imported when it runs, so that `--help` answers at once.
 """

@@ -1,13 +1,13 @@
 """Motions of a character: from training frames or from any poses, upright and on the ground."""
 
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from twofold.body.motion import Motion
 from twofold.capture.types import Capture, spread
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from twofold.outputs.export.bake import Pose
@@ -22,31 +22,6 @@ def capture_clip(baked: Baked, name: str = "capture") -> Clip:
     """The training motion in the capture's world, with the learned corrections of its poses."""
     times = sorted({frame.time for frame in baked.capture.train})
     return _clip(baked, name, training_poses(baked.capture), np.array(times) / baked.capture.fps)
-
-
-@runtime_checkable
-class Motion(Protocol):
-    """A pose sequence: axis-angle rotations (radians), SMPL's translations (metres), y up, evenly spaced in time."""
-
-    @property
-    def name(self) -> str:
-        """For titles."""
-        ...
-
-    @property
-    def poses(self) -> Float[Tensor, "T 24 3"]:
-        """Root first."""
-        ...
-
-    @property
-    def translations(self) -> Float[Tensor, "T 3"]:
-        """Added after the root has turned about its rest joint."""
-        ...
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        ...
 
 
 def motion_clip(baked: Baked, motion: Motion) -> Clip:

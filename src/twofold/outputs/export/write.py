@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from twofold.body.motion import Motion
 from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors, write_json
 from twofold.methods.base import Avatar
 from twofold.outputs.export.bake import BakeConfig, Progress
 from twofold.outputs.export.character import Character, Clip
-from twofold.outputs.export.clips import Motion, capture_clip, grounded, motion_clip, turned, upright
+from twofold.outputs.export.clips import capture_clip, grounded, motion_clip, turned, upright
 from twofold.outputs.export.formats import EXPORTERS
 from twofold.outputs.export.make import Baked, bake, frame_at, still
 from twofold.outputs.export.options import ExportOptions
