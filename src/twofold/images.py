@@ -37,11 +37,15 @@ class Header:
         width: columns as they are stored.
         height: rows as they are stored.
         mode: Pillow's name of the pixels' kind: "RGB", "L", "I;16", ...
+        deep: channels have more than 8 bits, of which Pillow keeps the upper 8 where they are colours.
+        upright: it is decoded as it is meant to be seen, or needs no turn for that.
     """
 
     width: int
     height: int
     mode: str
+    deep: bool = False
+    upright: bool = True
 
 
 def read_header(path: Path) -> Header:
@@ -51,7 +55,9 @@ def read_header(path: Path) -> Header:
         TwofoldError: it is missing, no image in one of `FORMATS`, or has more than `MAX_PIXELS`.
     """
     with _opened(path) as image:
-        return Header(*image.size, image.mode)
+        deep = image.mode.startswith("I") or image.mode == "F" or (bool(image.tile) and ";16" in str(image.tile[0][3]))
+        upright = image.format == "TIFF" or image.getexif().get(_ORIENTATION, 1) == 1
+        return Header(*image.size, image.mode, deep, upright)
 
 
 def upright_size(path: Path) -> tuple[int, int]:

@@ -15,7 +15,6 @@ from twofold.check.frame_measures import (
     frame_facts,
     look_at,
     mirrored_pose,
-    overlap,
     posed_points,
     read_mask,
     side_of_faces,
@@ -29,6 +28,7 @@ from twofold.geometry.cameras import project
 from twofold.geometry.raster import rasterize
 
 OTHER = [JOINT_NAMES.index(n.replace("left", "x").replace("right", "left").replace("x", "right")) for n in JOINT_NAMES]
+from twofold.prepare.silhouettes import overlap
 
 
 def joints_of(pose):

@@ -14,7 +14,8 @@ from tiny_person import ring_camera
 
 from twofold.body.skeleton import JOINT_NAMES
 from twofold.check.frame_measures import turned_round
-from twofold.check.motion_measures import LIMBS, SEEN_FROM, arc, motion_facts, sides_seen
+from twofold.check.motion_measures import LIMBS, motion_facts
+from twofold.prepare.turning import SEEN_FROM, arc, sides_seen
 
 
 @pytest.fixture

@@ -144,7 +144,7 @@ def test_bad_moments_are_left_out_and_listed(tmp_path, monkeypatch):
     done = stage.prepare(tmp_path / "me")
     kept = [t for t in range(24) if t not in (7, 8, 12)]
     assert done.kept == tuple(kept)
-    assert "3 moments were left out: 7-8, 12." in done.warnings
+    assert "3 moments were left out: 7-8 (the body does not cover the mask); 12 (nobody was found)." in done.warnings
     notes, splits = notes_of(tmp_path / "me"), splits_of(tmp_path / "me")
     assert notes["left_out"] == [7, 8, 12]
     assert notes["warnings"] == list(done.warnings)
@@ -210,7 +210,7 @@ def test_somebody_who_hardly_turns_is_warned(tmp_path, monkeypatch):
     stage.is_understood(monkeypatch)
     (warning,) = stage.prepare(tmp_path / "me").warnings
     assert "turns through only" in warning
-    assert notes_of(tmp_path / "me")["yaw_degrees"] == pytest.approx(np.degrees(13 / FPS), abs=1)
+    assert notes_of(tmp_path / "me")["yaw_degrees"] == pytest.approx(np.degrees(13 / FPS), abs=5)  # And walks
 
 
 def test_own_masks_and_poses_take_the_place_of_what_is_found(tmp_path, monkeypatch):

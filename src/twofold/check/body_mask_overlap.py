@@ -7,11 +7,8 @@ import numpy as np
 from twofold.check.findings import Finding, counted, graded, places, places_of
 from twofold.check.frame_measures import FrameFacts
 from twofold.check.measure import POOR, Doubt, Facts, inverted
+from twofold.prepare.silhouettes import LEAST_IOU, MOST_BAD
 
-BAD = 0.7
-"""A frame below this IoU is fitted badly: limbs are somewhere else."""
-MOST_BAD = 0.3
-"""With more bad frames than this the rest cannot outvote them."""
 BETTER, TELLING = 0.03, 0.1
 """A twin fits better when its IoU is higher by so much; it tells something where it covers so much else."""
 LARGER, SMALLER = 1.2, 0.92
@@ -43,7 +40,7 @@ def agreement(facts: Facts) -> Iterator[Finding]:
         late = "later" if moment > 0 else "earlier"
         explained.append(
             Finding(
-                graded(iou < BAD),
+                graded(iou < LEAST_IOU),
                 "moments",
                 f"Pictures fit the poses of {counted(abs(moment), 'moment')} {late} better, by {gain:.2f} in IoU",
                 f"Move the rows of motion.npz by {-moment:+d}, or rename the pictures.",
@@ -103,12 +100,12 @@ def _bad_frames(facts: Facts, frames: list[FrameFacts]) -> Iterator[Finding]:
             places_of((camera, time) for camera, time, _ in facts.elsewhere),
         )
     known = {(camera, time) for camera, time, _ in facts.elsewhere}
-    rest = [f for f in frames if f.iou < BAD and (f.camera, f.time) not in known]
+    rest = [f for f in frames if f.iou < LEAST_IOU and (f.camera, f.time) not in known]
     if rest:
         yield Finding(
             graded(len(rest) > MOST_BAD * len(frames)),
             "bad frames",
-            f"In {counted(len(rest), 'picture')} body and mask do not agree: IoU below {BAD:g}, down to "
+            f"In {counted(len(rest), 'picture')} body and mask do not agree: IoU below {LEAST_IOU:g}, down to "
             f"{min(f.iou for f in rest):.2f}",
             "Fit these again, mend their masks, or take them out of the splits.",
             places(rest),
@@ -117,7 +114,7 @@ def _bad_frames(facts: Facts, frames: list[FrameFacts]) -> Iterator[Finding]:
 
 def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
     telling = [f for f in frames if f.twins.sides_differ > TELLING]
-    swapped = [f for f in telling if f.twins.sides > max(f.twins.given + BETTER, BAD)]
+    swapped = [f for f in telling if f.twins.sides > max(f.twins.given + BETTER, LEAST_IOU)]
     if swapped:
         yield Finding(
             graded(len(swapped) > MOST_BAD * len(telling)),
@@ -137,7 +134,9 @@ def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
     turned = [
         f
         for f in frames
-        if f.twins.facing_differs > TELLING and f.twins.facing > max(f.twins.given + BETTER, BAD) and f not in swapped
+        if f.twins.facing_differs > TELLING
+        and f.twins.facing > max(f.twins.given + BETTER, LEAST_IOU)
+        and f not in swapped
     ]
     if turned:
         yield Finding(

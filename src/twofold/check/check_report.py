@@ -14,16 +14,16 @@ from scipy import ndimage
 
 from twofold.body.skeleton import ShapedBody, shape_body
 from twofold.capture.types import Capture, Frame, spread
-from twofold.check.body_mask_overlap import BAD
 from twofold.check.findings import Judgement, counted
 from twofold.check.frame_measures import FrameFacts, look_at, read_bytes, side_of_faces
 from twofold.check.measure import Facts
-from twofold.check.motion_measures import LIMBS, STILL, sides_seen
-from twofold.check.rules import SEEN
+from twofold.check.motion_measures import LIMBS, STILL
 from twofold.errors import TwofoldError
 from twofold.files import json_text, write_together
 from twofold.html.charts import SERIES, Bar, Curve, bars_svg, directions_svg, dots_svg
 from twofold.html.page import KeyMetric, Table, embedded_image, render
+from twofold.prepare.silhouettes import LEAST_IOU
+from twofold.prepare.turning import SEEN, sides_seen
 
 REPORT, NUMBERS = "index.html", "check.json"
 WORST, EVEN = 6, 12
@@ -158,7 +158,7 @@ def _sentence(judgement: Judgement) -> str:
 
 def _key_metrics(facts: Facts) -> list[KeyMetric]:
     ious = np.array([f.iou for f in facts.frames])
-    mean, bad = float(ious.mean()), int((ious < BAD).sum())
+    mean, bad = float(ious.mean()), int((ious < LEAST_IOU).sum())
     return [
         KeyMetric("Body on mask", f"{mean:.2f}", "IoU", f"{GOOD_IOU:g} or more", mean >= GOOD_IOU),
         KeyMetric("Badly fitted", f"{bad}", f"of {len(ious)}", "none", bad == 0),
@@ -177,7 +177,7 @@ def _sheets(facts: Facts, capture: Capture) -> list[dict[str, Any]]:
 
     def shown(f: FrameFacts) -> dict[str, Any]:
         pixels = overlay(frames[f.camera, f.time], shaped, sides)
-        return {"image": embedded_image(pixels, f"{f.camera} {f.time}", "jpeg"), "iou": f.iou, "low": f.iou < BAD}
+        return {"image": embedded_image(pixels, f"{f.camera} {f.time}", "jpeg"), "iou": f.iou, "low": f.iou < LEAST_IOU}
 
     with torch.inference_mode():
         return [
@@ -194,7 +194,7 @@ def _agreement(facts: Facts) -> dict[str, Any]:
     curves = [Curve(name, [f.time for f in own], [f.iou for f in own]) for name, own in series.items() if own]
     names = [curve.name for curve in curves]
     legend = names if len(names) <= SERIES else [*names[: SERIES - 1], "others"]
-    svg = dots_svg("Silhouette IoU over frames", curves, BAD)
+    svg = dots_svg("Silhouette IoU over frames", curves, LEAST_IOU)
     return {"svg": svg, "legend": legend if len(names) > 1 else []}
 
 

@@ -16,6 +16,7 @@ from twofold.geometry.cameras import Camera, project
 from twofold.geometry.raster import Hits, rasterize
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from twofold.images import read_grey, read_rgb
+from twofold.prepare.silhouettes import overlap
 
 LOOKED_AT = 320
 """Longest side, in pixels, at which body and mask are compared: finer than any fit is, and quick."""
@@ -206,12 +207,6 @@ def splat(pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"], height: int, 
     grown = tall[:, :-2] | tall[:, 1:-1] | tall[:, 2:]
     low = grown[:-2] & grown[1:-1] & grown[2:]
     return low[:, :-2] & low[:, 1:-1] & low[:, 2:]
-
-
-def overlap(one: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"]) -> float:
-    """Intersection over union; 0 where both are empty."""
-    union = np.count_nonzero(one | other)
-    return np.count_nonzero(one & other) / union if union else 0.0
 
 
 @dataclass(frozen=True)

@@ -7,22 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
 from PIL import Image
-from scipy import ndimage
 from skimage import data
 from skimage.feature import Cascade
-from skimage.registration import phase_cross_correlation
 
 from twofold.body.skeleton import JOINT_NAMES, ShapedBody, joint_transforms
 from twofold.capture.types import Frame
 from twofold.geometry.cameras import project
 from twofold.images import load_image
+from twofold.prepare.detect.background import Surroundings, background_motion, surroundings
 
-SIZE = 320
-"""Longest side at which backgrounds are compared, pixels."""
-PLAIN = 0.03
-"""A background whose brightness deviates by less (0..1) has nothing in it that could be seen to move."""
+DARK = 0.03
+"""Backgrounds that are darker on average (0..1) have no brightness to compare."""
 FACING_AWAY = -0.5
 """Below this cosine between face and camera no face is to be seen; a profile has 0."""
 HEAD, FACE = 0.44, (0.1, 0.3)
@@ -35,35 +31,33 @@ class Background:
 
     Attributes:
         times: moments that were compared with the first.
-        shift: the largest movement, as a share of the picture's longer side; None where nothing could be compared.
+        shift: the largest movement, as a share of the picture's longer side; None where it cannot be told.
         brightness: at each of these moments relative to the first; empty where nothing could be compared.
+        lost: there is a background with details, but it cannot be followed from picture to picture.
     """
 
     times: tuple[int, ...]
     shift: float | None
     brightness: tuple[float, ...]
+    lost: bool = False
 
 
 def background_of(frames: Sequence[Frame]) -> Background:
     """Compares the surroundings in pictures of one camera with those in the first of them."""
-    pictures = [_surroundings(frame) for frame in frames]
     times = tuple(frame.time for frame in frames[1:])
-    if len(pictures) < 2:
-        return Background((), None, ())
-    first, beside = pictures[0]
-    if np.count_nonzero(beside) < 0.1 * beside.size or first[beside].std() < PLAIN:
+    views = [_surroundings(frame) for frame in frames]
+    if len(views) < 2 or views[0].plain:
         return Background(times, None, ())
-    shifts: list[float] = []
     brightness: list[float] = []
-    for other, other_beside in pictures[1:]:
-        both = beside & other_beside
-        if np.count_nonzero(both) < 0.1 * both.size:
-            continue
-        shifts.append(_shift(first, beside, other, other_beside))
-        usual = float(np.median(first[both]))
-        if usual > PLAIN:
-            brightness.append(max(float(np.median(other[both])), 1e-3) / usual)
-    return Background(times, max(shifts, default=None), tuple(brightness))
+    for view in views[1:]:
+        both = views[0].beside & view.beside
+        usual = float(np.median(views[0].grey[both])) if np.count_nonzero(both) > 0.1 * both.size else 0.0
+        if usual > DARK:
+            brightness.append(max(float(np.median(view.grey[both])), 1e-3) / usual)
+    moved = background_motion(views).moved
+    longer = max(frames[0].camera.height, frames[0].camera.width)
+    lost = moved is None and sum(view.plain for view in views) < 0.5 * len(views)
+    return Background(times, None if moved is None else moved / longer, tuple(brightness), lost)
 
 
 def shows_its_back(frame: Frame, shaped: ShapedBody) -> bool:
@@ -109,25 +103,5 @@ def _box(x: float, y: float, half: float) -> tuple[int, int, int, int]:
     return left, top, left + size, top + size
 
 
-def _surroundings(frame: Frame) -> tuple[Float[np.ndarray, "a b"], Bool[np.ndarray, "a b"]]:
-    """A small grey picture, and which of its pixels are well away from the person."""
-    camera = frame.camera
-    scale = min(1.0, SIZE / max(camera.height, camera.width))
-    size = (max(round(scale * camera.width), 1), max(round(scale * camera.height), 1))
-    picture, mask = (load_image(file).convert("L") for file in (frame.image_file, frame.mask_file))
-    grey = np.asarray(picture.resize(size, Image.Resampling.BOX), np.float32) / 255
-    person = np.asarray(mask.resize(size, Image.Resampling.BOX)) > 0
-    return grey, ~np.asarray(ndimage.binary_dilation(person, iterations=max(round(0.02 * max(size)), 1)), dtype=bool)
-
-
-def _shift(first: np.ndarray, beside: np.ndarray, other: np.ndarray, other_beside: np.ndarray) -> float:
-    """How far the second background lies from the first, as a share of the longer side."""
-    found = phase_cross_correlation(first, other, reference_mask=beside, moving_mask=other_beside, overlap_ratio=0.5)
-    down, right = (round(float(s)) for s in found[0])
-    if (down, right) == (0, 0):
-        return 0.0
-    moved, moved_beside = (np.roll(a, (down, right), (0, 1)) for a in (other, other_beside))
-    before = np.abs(first - other)[beside & other_beside].mean()
-    after = np.abs(first - moved)[beside & moved_beside].mean()
-    # Repeating patterns fit many shifts; one that explains little is none.
-    return math.hypot(down, right) / max(first.shape) if after < 0.7 * before else 0.0
+def _surroundings(frame: Frame) -> Surroundings:
+    return surroundings(load_image(frame.image_file), load_image(frame.mask_file))

@@ -30,7 +30,7 @@ MOST_LOOKED_AT = 100
 """Pictures that are looked at unless more are asked for: a tenth of a second each."""
 MOST_VALIDATED = 1000
 """Pictures of a longer capture that are opened to find damaged ones; training opens them all."""
-SAMPLES, MOMENT_SAMPLES, BACKGROUNDS, BACKS, MOST_EXCHANGED = 12, 24, 6, 20, 40
+SAMPLES, MOMENT_SAMPLES, BACKGROUNDS, BACKS, MOST_EXCHANGED = 12, 24, 24, 20, 40
 """Frames on which conventions and moments are tried, backgrounds of a camera and views from behind that are looked at,
 bad frames whose pose is looked for elsewhere."""
 POOR = 0.65

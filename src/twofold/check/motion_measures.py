@@ -14,14 +14,13 @@ from torch import Tensor
 from twofold.body.skeleton import JOINT_NAMES, joint_transforms
 from twofold.capture.types import Frame, spread
 from twofold.geometry.rotations import axis_angle_to_matrix
+from twofold.prepare.turning import arc, camera_directions, sides_seen
 
 SLACK, ACCELERATION = 0.12, 40.0
 """A joint may stray from the middle between its neighbours in time by an estimator's error, metres, and by what four
 times gravity does to it, m/s2: more than hands do in quick sports."""
 TURN_SPEED = 12.0
 """Faster the trunk turns in no ordinary motion, rad/s: two turns a second is a figure skater's spin."""
-SEEN_FROM = math.radians(60)
-"""A camera sees a side of the body well up to this angle from straight on; beyond it is foreshortened by half."""
 NOVEL_BLOCK = 3
 """So many novel poses in a row may be a motion of their own, with a cut before and after."""
 NEW_POSE = math.radians(30)
@@ -121,26 +120,6 @@ def motion_facts(
     )
 
 
-def arc(azimuths: Sequence[float]) -> float:
-    """The smallest arc that holds all these directions, degrees.
-
-    >>> arc([350.0, 20.0, 0.0])
-    30.0
-    """
-    around = sorted(a % 360 for a in azimuths)
-    if not around:
-        return 0.0
-    gaps = [b - a for a, b in itertools.pairwise([*around, around[0] + 360])]
-    return 360 - max(gaps)
-
-
-def sides_seen(azimuths: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "360"]:
-    """For each degree around the body whether a camera (azimuth in radians) sees that side well."""
-    around = np.radians(np.arange(360) + 0.5)
-    away = np.abs((around[:, None] - azimuths + np.pi) % (2 * np.pi) - np.pi)
-    return (away <= SEEN_FROM).any(1)
-
-
 def _unseen(seen: Bool[np.ndarray, "360"]) -> str:
     if seen.all() or not seen.any():
         return ""
@@ -162,9 +141,8 @@ def _directions(
     """Where the camera of each frame stands as the body sees it: degrees around and above."""
     if not frames:
         return [], []
-    away = torch.stack([roots[f.time].T @ (f.camera.center - pelvises[f.time]) for f in frames])
-    x, y, z = torch.nn.functional.normalize(away, dim=-1).unbind(-1)
-    return torch.rad2deg(torch.atan2(x, z)).tolist(), torch.rad2deg(torch.asin(y.clamp(-1, 1))).tolist()
+    times = [frame.time for frame in frames]
+    return camera_directions(roots[times], pelvises[times], torch.stack([frame.camera.center for frame in frames]))
 
 
 def _runs(times: Sequence[int], novel: Set[int]) -> list[list[int]]:

@@ -6,11 +6,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from twofold.capture.layout import spans
-from twofold.check.body_mask_overlap import MOST_BAD, agreement
+from twofold.check.body_mask_overlap import agreement
 from twofold.check.findings import Finding, Judgement, Level, counted, graded, places, places_of
 from twofold.check.frame_measures import FrameFacts
 from twofold.check.measure import CameraFacts, Facts, inverted
 from twofold.check.motion_measures import LIMBS, STILL
+from twofold.prepare.detect.background import MOVING
+from twofold.prepare.silhouettes import MOST_BAD
+from twofold.prepare.turning import SEEN
 
 STATURES, POSSIBLE_STATURES = (1.2, 2.2), (0.5, 3.0)
 """Metres; children and giants in the wider range. Networks, voxels and losses are made for metres."""
@@ -20,8 +23,8 @@ VIEW_ANGLES = (8.0, 110.0)
 """Degrees: a long telephoto lens and an action camera. Beyond these, a made-up focal length (5000, say) is likelier."""
 ODD_PIXELS, OFF_CENTER = 0.05, 0.15
 """fy against fx; distance of the principal point from the picture's middle, in picture lengths."""
-MOVING, BRIGHTER = 0.01, 1.3
-"""Shift of a background in picture lengths; ratio of its brightnesses: a third of an aperture stop."""
+BRIGHTER = 1.3
+"""Ratio of the brightnesses of a background: a third of an aperture stop."""
 HARD, SOFT, RAGGED, GRAIN = 0.05, 0.03, 0.0015, 0.012
 """Masks: width of the soft edge in pixels below which it is hard; in body heights, the width above which it is too soft
 (5 cm), how far an outline strays from a smooth one (3 mm, good ones 1 mm), and how large its steps are (2 cm)."""
@@ -29,8 +32,6 @@ LOOSE = 0.05
 """Share of a mask that does not hang together with the rest: a forearm."""
 CROPPED, CUT_OFF = 0.1, 0.3
 """Share of the frames that may touch the border; share of the body that may be outside on average."""
-SEEN = 300.0
-"""Degrees around the body that training cameras see; a body turning through half a circle shows as much."""
 FEWEST, FEW = 8, 20
 """Training pictures: fewer cannot tell pose from chance; from the second on it begins to work."""
 JITTER = 0.03
@@ -271,6 +272,14 @@ def _backgrounds(facts: Facts) -> Iterator[Finding]:
                 f"The background moves by {background.shift:.1%} of the picture, so the camera does not stand still",
                 "Poses must be relative to the camera at each moment, and light that stays in the world will blur; "
                 "film from a tripod.",
+                f"camera {name}",
+            )
+        elif background.lost:
+            yield Finding(
+                "warning",
+                "moving camera",
+                "The background differs so much from image to image that nothing tells whether the camera stands still",
+                "Film from a tripod, before a background that does not move.",
                 f"camera {name}",
             )
         elif max(ratios) > BRIGHTER * min(ratios):

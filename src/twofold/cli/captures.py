@@ -76,6 +76,8 @@ def prepare(
     held_out: int = 10,
     held_objects: Literal["keep", "remove"] = "remove",
     several_people: Literal["refuse", "ignore"] = "refuse",
+    person: Literal["largest", "masks"] | int | None = None,
+    drop: str | None = None,
     credit: str = "",
 ) -> None:
     """Makes a capture folder from a video of one person, or from several of the same moments.
@@ -94,18 +96,21 @@ def prepare(
         train_camera: Which of several videos trains; by default the first.
         held_out: Of so many moments one is kept for testing.
         held_objects: Whether a ball or the like is taken out of the masks.
-        several_people: Whether a second person in view ends it, or is left to the masks.
+        several_people: Whether a second person in view ends it, or whoever is found is taken.
+        person: Which of several people is meant: the largest, a number (1 is the leftmost in the first image), or the
+            one in your own masks; by default the one in your own masks, landmarks or poses.
+        drop: Frames to leave out of the splits, such as 3,7-9.
         credit: Whom to name when showing the pictures.
     """
     from twofold.prepare.detect.blazepose import mediapipe_estimator
     from twofold.prepare.detect.people import count_people
     from twofold.prepare.pipeline import prepare as make
     from twofold.prepare.pipeline import read_body
-    from twofold.prepare.video.clips import PrepareConfig, read_intrinsics
+    from twofold.prepare.video.clips import PrepareConfig, read_frames, read_intrinsics
 
     config = PrepareConfig(
         fps, max_size, read_intrinsics(intrinsics), calibration, train_camera, held_out, held_objects, credit,
-        masks, landmarks, poses, several_people,
+        masks, landmarks, poses, several_people, person, read_frames(drop),
     )  # fmt: skip
     with bar("Preparing") as show:
         prepared = make(videos, out, read_body(body), mediapipe_estimator, config, show, count_people)

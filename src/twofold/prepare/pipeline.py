@@ -18,22 +18,21 @@ from twofold.capture.folder import CaptureWriter
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors
 from twofold.geometry.cameras import Camera
-from twofold.prepare.cameras.calibration import pinhole, undistort, undistorter
+from twofold.geometry.rotations import axis_angle_to_matrix
+from twofold.prepare.cameras.calibration import pinhole, undistorter
 from twofold.prepare.cameras.triangulation import triangulate, turn_cameras
-from twofold.prepare.detect.landmark_files import landmarks_from_file, track_at
 from twofold.prepare.detect.left_right import repair_swaps, repair_with_views
-from twofold.prepare.detect.mask_files import masks_from_folder
-from twofold.prepare.detect.people import People
-from twofold.prepare.detect.scan import Watched, watch_clip
+from twofold.prepare.detect.people import People, people_finder
+from twofold.prepare.detect.scan import Watched, watch_clip, with_masks
 from twofold.prepare.detections import Estimator, Track
 from twofold.prepare.fitting.fit import fit
 from twofold.prepare.fitting.observations import Evidence
-from twofold.prepare.fitting.parameters import Motion, choose, pose_motion
-from twofold.prepare.fitting.pose_files import poses_from_file
+from twofold.prepare.fitting.parameters import Motion, choose, pose_motion, root_of
+from twofold.prepare.fitting.pose_files import motion_at
 from twofold.prepare.fitting.world_up import stand_upright, up_direction
+from twofold.prepare.given import Finder, Given, chosen_landmarks, chosen_masks, read_given, region_finder
 from twofold.prepare.output.acceptance import (
     FARTHER,
-    LARGER,
     STEADIER,
     PictureQuality,
     kept_times,
@@ -41,10 +40,10 @@ from twofold.prepare.output.acceptance import (
     require_person,
     require_whole,
     warnings_about,
-    yaw_range,
 )
 from twofold.prepare.output.review import Agreement, compare_with_pictures
-from twofold.prepare.video.clips import Clip, PrepareConfig, advice, longer, open_clips, require_options
+from twofold.prepare.turning import arc, camera_directions
+from twofold.prepare.video.clips import Clip, PrepareConfig, advice, longer, open_clips, rate_of, require_options
 
 Show = Callable[[float, str], None]
 
@@ -58,12 +57,14 @@ class Prepared:
         kept: moments in the splits.
         qualities: a record of every picture.
         warnings: sentences for the user.
+        objects: share of the mask that held objects took, of each picture that has some and is kept.
     """
 
     folder: Path
     kept: tuple[int, ...]
     qualities: tuple[PictureQuality, ...]
     warnings: tuple[str, ...]
+    objects: tuple[float, ...] = ()
 
     def summary(self) -> str:
         """What came of it in a few words."""
@@ -71,6 +72,18 @@ class Prepared:
         return (
             f"{len(self.kept)} of {moments} moments, silhouette IoU {self.mean('iou'):.2f}, landmarks off by "
             f"{self.mean('reprojection'):.1f} pixels ({self.mean('reprojection_percent'):.1f} % of the body's height)."
+            f"{self._objects()}"
+        )
+
+    def _objects(self) -> str:
+        """How much of the masks was taken for held objects."""
+        if not self.objects:
+            return ""
+        pictures = sum(quality.time in set(self.kept) for quality in self.qualities)
+        return (
+            f" Held objects were taken out in {len(self.objects)} of {pictures} pictures, at most "
+            f"{100 * max(self.objects):.1f} % and on average {100 * sum(self.objects) / max(pictures, 1):.1f} % of the "
+            "person's mask; the report of check shows them, --held-objects keep leaves them."
         )
 
     def mean(self, what: Literal["iou", "reprojection", "reprojection_percent"]) -> float:
@@ -88,6 +101,7 @@ def prepare(
     show: Show | None = None,
     people: Callable[[Sequence[UInt8[np.ndarray, "h w 3"]]], People] | None = None,
     overwrite: bool = False,
+    finder: Finder = people_finder,
 ) -> Prepared:
     """Makes a capture folder from one clip, or from several of the same moments by calibrated cameras.
 
@@ -100,6 +114,7 @@ def prepare(
         show: told the share that is done and what is being done.
         people: counts who is in view; None to trust that it is one person.
         overwrite: a capture that lies at `out` gives way.
+        finder: finds everybody in an image, where one of several people is chosen.
 
     Raises:
         TwofoldError: a clip cannot be read or cannot work, the calibration does not go with the clips, or `out` cannot
@@ -113,11 +128,13 @@ def prepare(
         tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.resolve().parent) as scratch,
     ):  # fmt: skip
         ready = open_clips(clips, config)
-        watched = _watch_all(ready, Path(scratch), estimator, config, show)
-        if people is not None and config.several_people == "refuse":
+        given = read_given(ready, config, body)
+        watched, remarks = _watch_all(ready, given, Path(scratch), estimator, finder, body, config, show)
+        chosen = any(piece is not None for piece in (config.person, config.masks, config.landmarks, config.poses))
+        if people is not None and config.several_people == "refuse" and not chosen:
             for clip, seen in zip(ready, watched, strict=True):
                 require_one_person(people(seen.sample), clip.path)
-        found = _fit_all(ready, watched, body, config, show)
+        found = _fit_all(ready, given, watched, body, config, show, remarks)
         agreed = _judge_all(found, body, config, show)
         prepared = _write(writer, out, found, agreed, body, config)
     show(1.0, "done")
@@ -142,39 +159,54 @@ def require_one_person(people: People, clip: Path) -> None:
     if people.too_many:
         raise TwofoldError(
             f"{clip} shows several people of about the same size in {100 * people.several:.0f} % of its pictures, and "
-            "which of them is meant nobody can tell; cut the clip to one person, or take --several-people ignore."
+            "which of them is meant nobody can tell; take --person largest, --person 1 (the leftmost in the first "
+            "image, 2 the next), or your own --masks, or cut the clip to one person."
         )
 
 
 def _watch_all(
-    ready: Sequence[Clip], scratch: Path, estimator: Callable[[], Estimator], config: PrepareConfig, show: Show
-) -> list[Watched]:
+    ready: Sequence[Clip],
+    given: Sequence[Given],
+    scratch: Path,
+    estimator: Callable[[], Estimator],
+    finder: Finder,
+    body: Body,
+    config: PrepareConfig,
+    show: Show,
+) -> tuple[list[Watched], list[str]]:
+    """What is seen in each clip at the steps of time that all show, and sentences for the user."""
     watched: list[Watched] = []
-    for k, clip in enumerate(ready):
-        own = None if config.masks is None else masks_from_folder(_piece(config.masks, clip, len(ready)), clip.info)
+    remarks: list[str] = []
+    for k, (clip, own) in enumerate(zip(ready, given, strict=True)):
         straighten = None if clip.lens is None else undistorter(clip.lens, clip.info.height, clip.info.width)
-        finder = estimator()
+        found = estimator()
         try:
-            seen = watch_clip(
-                clip.frames, clip.info.frames, finder, scratch / clip.name, straighten, own,
-                lambda done, k=k: show(0.3 * (k + done) / len(ready), "looking at the pictures"),
-            )  # fmt: skip
+            with region_finder(own, clip, body, config, finder) as region:
+                seen = watch_clip(
+                    clip.frames, clip.info.frames, found, scratch / clip.name, straighten,
+                    [] if own.masks is None else own.masks.readings(),
+                    lambda done, k=k: show(0.3 * (k + done) / len(ready), "looking at the pictures"), region,
+                )  # fmt: skip
         finally:
-            finder.close()
+            found.close()
+        if own.masks is not None and own.masks.others:
+            masks, sentence = chosen_masks(own.masks, seen.overlaps)
+            seen = with_masks(seen, masks, straighten)
+            remarks.append(sentence)
+        remarks += [f"{clip.name}: {remark}" for remark in clip.frames.remarks]
+        if seen.repeated:
+            remarks.append(f"{clip.name}: {seen.repeated} pictures equal the one before them and are left out.")
         require_length(len(seen.images), str(clip.path))
         if config.landmarks is None:
             require_person(seen.track, str(clip.path))
         watched.append(seen)
-    moments = min(len(seen.images) for seen in watched)
-    # Synchronised clips end a picture or two apart.
-    return [_cut(seen, moments) for seen in watched]
-
-
-def _cut(seen: Watched, moments: int) -> Watched:
-    track = replace(seen.track, **{name: value[:moments] for name, value in vars(seen.track).items()})
-    return replace(
-        seen, images=seen.images[:moments], masks=seen.masks[:moments], sources=seen.sources[:moments], track=track
-    )
+    if len(watched) == 1:
+        return watched, remarks
+    # Synchronised clips end a picture or two apart, and may lack one in between.
+    shared = set[int].intersection(*(set(seen.steps) for seen in watched))
+    together = [seen.at([i for i, step in enumerate(seen.steps) if step in shared]) for seen in watched]
+    require_length(len(shared), "What all videos show at the same time")
+    return together, remarks
 
 
 @dataclass(frozen=True)
@@ -191,15 +223,25 @@ class _Found:
 
 
 def _fit_all(
-    ready: Sequence[Clip], watched: Sequence[Watched], body: Body, config: PrepareConfig, show: Show
+    ready: Sequence[Clip],
+    given: Sequence[Given],
+    watched: Sequence[Watched],
+    body: Body,
+    config: PrepareConfig,
+    show: Show,
+    remarks: list[str],
 ) -> _Found:
-    fps = ready[0].info.fps
-    seconds = np.arange(len(watched[0].images)) / fps
+    seconds = np.array(watched[0].seconds)
+    fps = rate_of(seconds, ready[0].info.fps)
     tracks = [seen.track for seen in watched]
     calibrated = [clip.calibrated for clip in ready if clip.calibrated is not None]
     cameras = [clip.camera for clip in ready]
     in_space: Float[np.ndarray, "t 33 3"] | None = None
-    own = [_own_landmarks(clip, seen, config, len(ready)) for clip, seen in zip(ready, watched, strict=True)]
+    own: list[Track | None] = [None] * len(ready)
+    for k, (piece, seen) in enumerate(zip(given, watched, strict=True)):
+        if piece.landmarks and config.landmarks is not None:
+            own[k], sentence = chosen_landmarks(piece, seen.track, seen.sources, config.landmarks)
+            remarks += [sentence] if sentence else []
     show(0.3, "telling left from right")
     if len(tracks) > 1:
         repairs = repair_with_views(tracks, calibrated, seconds)
@@ -214,8 +256,8 @@ def _fit_all(
         Evidence(camera, track, seen.masks) for camera, track, seen in zip(cameras, tracks, watched, strict=True)
     ]
     free = config.intrinsics is None and config.calibration is None
-    if config.poses is not None:
-        motion = poses_from_file(config.poses, ready[0].info, watched[0].sources, body)
+    if given[0].motion is not None:
+        motion = motion_at(given[0].motion, watched[0].sources)
     else:
         motion = fit(
             body, evidence, fps, free, points_in_space=in_space,
@@ -226,31 +268,7 @@ def _fit_all(
     motion = replace(motion, log_focal=torch.zeros(()))
     watched = [replace(seen, track=track) for seen, track in zip(watched, tracks, strict=True)]
     cameras = {clip.name: camera for clip, camera in zip(ready, scaled, strict=True)}
-    remarks = [f"{clip.name}: {remark}" for clip in ready for remark in clip.frames.remarks]
     return _Found(motion, cameras, watched, fps, swapped, config.calibration is not None, remarks)
-
-
-def _piece(place: Path, clip: Clip, clips: int) -> Path:
-    """Where the user's own pieces of a clip lie: at the place itself, or there under the clip's name."""
-    if clips == 1:
-        return place
-    found = sorted(p for p in place.iterdir() if p.stem == clip.path.stem) if place.is_dir() else []
-    if not found:
-        raise TwofoldError(f"{place} has nothing called {clip.path.stem}; with several videos, name each after its.")
-    return found[0]
-
-
-def _own_landmarks(clip: Clip, seen: Watched, config: PrepareConfig, clips: int) -> Track | None:
-    """The user's own landmarks; how they lie in space is left to the estimator."""
-    if config.landmarks is None:
-        return None
-    track = landmarks_from_file(_piece(config.landmarks, clip, clips), clip.info)
-    track = track_at(track, seen.sources)
-    require_person(track, str(config.landmarks), advice(config, LARGER, ("landmarks",)))
-    pixels = track.pixels
-    if clip.lens is not None:
-        pixels = undistort(clip.lens, pixels.astype(np.float64)).astype(np.float32)
-    return replace(track, pixels=pixels, world=np.where(np.isfinite(track.world), track.world, seen.track.world))
 
 
 def _judge_all(found: _Found, body: Body, config: PrepareConfig, show: Show) -> list[Agreement]:
@@ -285,9 +303,9 @@ def _write(
 ) -> Prepared:
     watched = found.watched
     qualities = [quality for agreement in agreed for quality in agreement.qualities]
-    kept = kept_times(qualities, ", ".join(found.cameras), advice(config, STEADIER))
+    kept, left_out = kept_times(qualities, ", ".join(found.cameras), advice(config, STEADIER), config.drop)
     poses, translations, cameras = _upright(found, body)
-    train = _training_camera(list(cameras), config.train_camera)
+    train = config.train_camera or next(iter(cameras))
     held_out = [time for number, time in enumerate(kept) if number % config.held_out == config.held_out // 2]
     trained = [time for time in kept if time not in set(held_out)]
     for name, seen, agreement in zip(cameras, watched, agreed, strict=True):
@@ -297,10 +315,12 @@ def _write(
             if time in agreement.ignored:
                 writer.ignored_file(name, time, agreement.ignored[time])
     index = list(cameras).index(train)
-    dropped = sorted(set(range(len(poses))) - set(kept))
-    yaw = yaw_range(poses[trained], cameras[train])
+    pelvises = translations[trained] + root_of(body, found.motion.betas)
+    roots, center = axis_angle_to_matrix(poses[trained, 0]), cameras[train].center
+    yaw = arc(camera_directions(roots, pelvises, center.expand(len(roots), 3))[0])
     moved, width = watched[index].moved, cameras[train].width
-    warnings = [*found.remarks, *warnings_about(yaw, moved, width, dropped, len(cameras) > 1)]
+    warnings = [*found.remarks, *warnings_about(yaw, moved, width, left_out, len(cameras) > 1)]
+    objects = {name: a.removed for name, a in zip(cameras, agreed, strict=True)}
     writer.finish(
         name=out.name,
         body=body,
@@ -319,17 +339,21 @@ def _write(
             "made_by": "twofold prepare",
             "clips": list(cameras),
             "every_held_out": config.held_out,
-            "left_out": dropped,
+            "left_out": sorted(left_out),
+            "left_out_because": {str(time): left_out[time] for time in sorted(left_out)},
             "sides_exchanged": found.swapped,
             "clip_picture": {name: list(seen.sources) for name, seen in zip(cameras, watched, strict=True)},
             "objects_ignored": {n: sorted(a.ignored) for n, a in zip(cameras, agreed, strict=True)},
+            "objects_share_of_mask": {n: {str(t): round(s, 4) for t, s in r.items()} for n, r in objects.items()},
+            "seconds": [round(second, 4) for second in watched[0].seconds],
             "yaw_degrees": round(yaw, 1),
-            "background_moves_pixels": round(moved, 1),
+            "background_moves_pixels": None if moved is None else round(moved, 1),
             "warnings": warnings,
             "quality": [quality.row() for quality in qualities],
         },
     )
-    return Prepared(out, tuple(kept), tuple(qualities), tuple(warnings))
+    shares = [share for removed in objects.values() for time, share in removed.items() if time in set(kept)]
+    return Prepared(out, tuple(kept), tuple(qualities), tuple(warnings), tuple(shares))
 
 
 def _upright(found: _Found, body: Body) -> tuple[Tensor, Tensor, Mapping[str, Camera]]:
@@ -339,13 +363,5 @@ def _upright(found: _Found, body: Body) -> tuple[Tensor, Tensor, Mapping[str, Ca
     posed = pose_motion(body, motion)
     some = posed.place(choose(body, torch.arange(0, len(body.template), 7)))
     lowest = float(torch.quantile((some @ up).amin(1), 0.1))
-    root = body.joints[0] + body.joint_basis[0, :, : len(betas)] @ betas
+    root = root_of(body, betas)
     return stand_upright(up, root, lowest, poses, motion.translation, found.cameras)
-
-
-def _training_camera(names: Sequence[str], wanted: str | None) -> str:
-    if wanted is None:
-        return names[0]
-    if wanted not in names:
-        raise TwofoldError(f"--train-camera {wanted} is none of the clips; they are {', '.join(names)}.")
-    return wanted

@@ -129,8 +129,21 @@ def test_sizes_that_do_not_go_together_are_refused(size, sentence):
 def test_calibration_without_a_size_takes_the_videos():
     view = for_pictures(replace(camera(), height=None, width=None), picture(1280, 720))
     assert (view.height, view.width) == (1280, 720)
-    with pytest.raises(TwofoldError, match=r"principal point at .*, far from the middle of its 2160x3840 pictures"):
-        for_pictures(replace(camera(), height=None, width=None), picture(3840, 2160))
+    for width, height in ((2160, 3840), (540, 960), (1080, 1920)):
+        with pytest.raises(TwofoldError, match=f"the middle of images of about 720x1280, and the video has {width}x"):
+            for_pictures(replace(camera(), height=None, width=None), picture(height, width))
+
+
+@pytest.mark.parametrize(("height", "width"), [(640, 368), (848, 480), (1920, 1088)])
+def test_a_side_that_an_encoder_rounded_has_its_own_scale(height, width):
+    """720 x 1280 scaled to 360 x 640, 477 x 848 and 1080 x 1920, whose shorter sides became multiples of 16."""
+    view = for_pictures(camera(), picture(height, width))
+    assert (view.height, view.width) == (height, width)
+    across, down = width / 720, height / 1280
+    assert view.intrinsics[0, 0] == pytest.approx(across * camera().intrinsics[0, 0])
+    assert view.intrinsics[1, 1] == pytest.approx(down * camera().intrinsics[1, 1])
+    middle = (camera().intrinsics[:2, 2] + 0.5) * [across, down] - 0.5
+    assert view.intrinsics[:2, 2] == pytest.approx(middle)
 
 
 def distorted_literally(view, pixel):

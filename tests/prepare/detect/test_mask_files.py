@@ -6,8 +6,10 @@ from made_clips import corners, grey, write_clip
 from PIL import Image
 
 from twofold.errors import TwofoldError
-from twofold.prepare.detect.mask_files import masks_from_folder, read_mask
-from twofold.prepare.video.frames import ClipInfo, Frames, describe, files_by_picture
+from twofold.prepare.detect.mask_files import masks_from_folder
+from twofold.prepare.detect.mask_values import read_mask
+from twofold.prepare.video.frames import ClipInfo, Frames, describe
+from twofold.prepare.video.numbering import files_by_picture
 
 CLIP = ClipInfo(64, 48, 25.0, 10, 0.4, 64, 48, 10)
 
@@ -43,10 +45,18 @@ def test_masks_find_their_pictures(tmp_path, names):
     assert masks(10) is None
 
 
-def test_masks_without_anybody_are_named_at_once(tmp_path):
+@pytest.mark.parametrize(
+    ("level", "sentence"),
+    [
+        (0, r"All masks in .* are black, so nobody is in them"),
+        (2, r"reach only 2: are they labels of several objects"),
+        (100, r"reach only 100, so nobody is in them; make the person 255"),
+    ],
+)
+def test_masks_without_anybody_are_named_at_once(tmp_path, level, sentence):
     for number in range(10):
-        Image.new("L", (64, 48), 100).save(tmp_path / f"{number}.png")
-    with pytest.raises(TwofoldError, match=r"All masks in .* are black, so nobody is in them"):
+        Image.new("L", (64, 48), level).save(tmp_path / f"{number}.png")
+    with pytest.raises(TwofoldError, match=sentence):
         masks_from_folder(tmp_path, CLIP)
     Image.new("L", (64, 48), 255).save(tmp_path / "9.png")
     assert rows(masks_from_folder(tmp_path, CLIP)(9)) == 48
@@ -113,11 +123,6 @@ def test_soft_edges_stay_soft(tmp_path):
     assert np.array_equal(read_mask(tmp_path / "soft.png").ravel(), np.arange(256))
     Image.fromarray(256 * np.arange(256, dtype=np.uint16).reshape(16, 16)).save(tmp_path / "deep.png")
     assert np.array_equal(read_mask(tmp_path / "deep.png").ravel(), np.round(256 * np.arange(256) / 257))
-
-
-def test_an_empty_mask_stays_empty(tmp_path):
-    Image.fromarray(np.zeros((4, 4), np.uint8)).save(tmp_path / "empty.png")
-    assert not read_mask(tmp_path / "empty.png").any()
 
 
 @pytest.mark.parametrize(

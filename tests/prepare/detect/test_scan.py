@@ -123,7 +123,8 @@ def pictures(count, step=0, alive=None, every=1):
         image = background[20 : 20 + HEIGHT, left : left + WIDTH].copy()
         if alive is not None:
             alive.append(weakref.ref(image))
-        yield Picture(k, k / 10, image, every * k)
+        image[0, k % WIDTH] = k  # No two are equal
+        yield Picture(k, k / 10, image, every * k, k)
 
 
 def test_pictures_masks_and_landmarks_are_put_aside(tmp_path):
@@ -166,11 +167,11 @@ def test_own_masks_are_taken_as_they_are(tmp_path):
     def given(source):
         return own if source == 4 else None
 
-    seen = watch_clip(pictures(3, every=4), 3, Finder(), tmp_path, given=given)
+    seen = watch_clip(pictures(3, every=4), 3, Finder(), tmp_path, given=[given])
     stored = [np.asarray(Image.open(path)) for path in seen.masks]
     assert np.array_equal(stored[1], own)
     assert np.array_equal(stored[0], disc(21))
-    seen = watch_clip(pictures(3, every=4), 3, Finder(), tmp_path, lambda image: np.roll(image, 3, 1), given)
+    seen = watch_clip(pictures(3, every=4), 3, Finder(), tmp_path, lambda image: np.roll(image, 3, 1), [given])
     with Image.open(seen.masks[1]) as picture:
         assert np.array_equal(np.asarray(picture), np.roll(own, 3, 1))
 

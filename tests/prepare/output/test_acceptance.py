@@ -10,15 +10,12 @@ import torch
 from acting import standing_camera
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from scipy import ndimage
 
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
-from twofold.prepare.detect.background import background_shift
 from twofold.prepare.detections import LANDMARKS, Track
 from twofold.prepare.output.acceptance import (
-    LEAST_IOU,
     LEAST_PICTURES,
     LEAST_VISIBILITY,
     MOST_REPROJECTION,
@@ -29,8 +26,9 @@ from twofold.prepare.output.acceptance import (
     require_person,
     require_whole,
     warnings_about,
-    yaw_range,
 )
+from twofold.prepare.silhouettes import LEAST_IOU
+from twofold.prepare.turning import arc, camera_directions
 
 CAMERA = standing_camera()
 GOOD = PictureQuality("cam", 0, 0.9, 1.0, 1.0, 0.9, False)
@@ -142,20 +140,35 @@ def records(faults, moments=20, cameras=("a", "b")):
 
 def test_moments_that_any_camera_shows_badly_are_left_out():
     faults = {("a", 3): "x", ("b", 3): "y", ("b", 7): "z"}
-    assert kept_times(records(faults), "clip") == [t for t in range(20) if t not in (3, 7)]
+    assert kept_times(records(faults), "clip")[0] == [t for t in range(20) if t not in (3, 7)]
 
 
 @given(bad=st.integers(0, 20))
 def test_more_than_three_in_ten_bad_moments_are_too_many(bad):
     faults = {("a", 19 - k): f"reason {19 - k}" for k in range(bad)}
     if bad <= 6:
-        assert len(kept_times(records(faults), "clip")) == 20 - bad
+        kept, left_out = kept_times(records(faults), "clip")
+        assert len(kept) == 20 - bad
+        assert left_out == {time: reason for (_, time), reason in faults.items()}
         return
     with pytest.raises(TwofoldError) as error:
         kept_times(records(faults), "clip")
     span = f"{20 - bad}-19"
     assert f"{bad} of 20 pictures of clip could not be understood (moments {span})" in str(error.value)
     assert f"at {20 - bad}, for one, reason {20 - bad}; film one person" in str(error.value)
+
+
+def test_dropped_moments_are_left_out_and_are_no_reason_to_refuse():
+    kept, left_out = kept_times(records({("a", 3): "reason 3"}), "clip", drop=range(5, 15))
+    assert kept == [0, 1, 2, 4, *range(15, 20)]
+    assert left_out == {3: "reason 3"} | dict.fromkeys(range(5, 15), "asked for with --drop")
+    with pytest.raises(TwofoldError, match="--drop leaves 2 pictures of clip"):
+        kept_times(records({}), "clip", drop=range(2, 20))
+
+
+def yaw_range(pose, camera):
+    roots = axis_angle_to_matrix(pose[:, 0])
+    return arc(camera_directions(roots, torch.zeros(len(roots), 3), camera.center.expand(len(roots), 3))[0])
 
 
 def facing(angles, tilt=(0.0, 0.0, 0.0), camera=CAMERA):
@@ -207,41 +220,16 @@ def test_leaning_is_no_turning():
         ({"moved": 8.0}, ["background moves by up to 8 pixels"]),
         ({"moved": 8.0, "several": True}, ["--set training.rate_pose=1e-4"]),
         ({"moved": 6.0}, []),
-        ({"dropped": [3, 4, 9]}, ["3 moments were left out: 3-4, 9."]),
-        ({"yaw": 10.0, "moved": 30.0, "dropped": [0]}, ["only 10 degrees", "moves by up to 30", "1 moments"]),
+        ({"moved": None}, []),
+        (
+            {"left_out": {3: "nobody was found", 4: "nobody was found", 9: "too dark (0.1)"}},
+            ["3 moments were left out: 3-4 (nobody was found); 9 (too dark)."],
+        ),
+        ({"yaw": 10.0, "moved": 30.0, "left_out": {0: "x"}}, ["only 10 degrees", "moves by up to 30", "1 moments"]),
     ],
 )
 def test_warnings_say_what_to_know(changes, words):
-    given = {"yaw": 350.0, "moved": 0.0, "width": 640, "dropped": [], "several": False} | changes
+    given = {"yaw": 350.0, "moved": 0.0, "width": 640, "left_out": {}, "several": False} | changes
     found = warnings_about(**given)
     assert len(found) == len(words)
     assert all(word in sentence for word, sentence in zip(words, found, strict=True))
-
-
-def wall(seed=0, height=90, width=160):
-    """A background with something to see on it, larger than the picture by 20 pixels on each side."""
-    rng = np.random.default_rng(seed)
-    noise = ndimage.gaussian_filter(rng.standard_normal((height + 40, width + 40)), 2)
-    return (0.5 + 0.15 * noise / noise.std()).clip(0, 1).astype(np.float32)
-
-
-def picture(background, across=0, down=0, person=40, seed=1):
-    """What a camera sees of that wall, with a person of noise before it; and where the person is."""
-    image = background[20 + down : -20 + down or None, 20 + across : -20 + across or None].copy()
-    mask = np.zeros(image.shape, bool)
-    mask[20:80, person : person + 25] = True
-    image[mask] = np.random.default_rng(seed).random(int(mask.sum()))
-    return image, mask
-
-
-@given(across=st.integers(-12, 12), down=st.integers(-8, 8), person=st.integers(10, 110), seed=st.integers(0, 99))
-def test_a_background_that_moves_is_noticed_whatever_the_person_does(across, down, person, seed):
-    first, _ = picture(wall(seed))
-    now, mask = picture(wall(seed), across, down, person, seed=2)
-    assert background_shift(first, now, mask) == pytest.approx(math.hypot(across, down), abs=0.5)
-
-
-def test_pictures_without_a_background_say_nothing():
-    first, mask = picture(wall())
-    assert background_shift(first, np.full_like(first, 0.3), mask) == 0
-    assert background_shift(first, picture(wall(), 8)[0], np.ones_like(mask)) == 0

@@ -13,7 +13,15 @@ from twofold.errors import TwofoldError
 from twofold.files import write_json
 from twofold.geometry.cameras import Camera, project
 from twofold.prepare.cameras.calibration import undistort
-from twofold.prepare.video.clips import FOCAL_GUESS, PrepareConfig, longer, open_clips, read_intrinsics, require_options
+from twofold.prepare.video.clips import (
+    FOCAL_GUESS,
+    PrepareConfig,
+    clip_names,
+    longer,
+    open_clips,
+    read_intrinsics,
+    require_options,
+)
 
 PLAIN = PrepareConfig()
 
@@ -114,9 +122,8 @@ def test_a_lens_that_moves_nothing_by_half_a_pixel_is_none(tmp_path):
 )  # fmt: skip
 def test_names_of_clips_become_names_of_folders(tmp_path, file, name):
     if file == "...":
-        from twofold.prepare.video.clips import _folder_name
-
         assert _folder_name(file) == name
+        assert clip_names([tmp_path / "..."]) == [name]
         return
     (clip,) = open_clips([a_clip(tmp_path, file)], PLAIN)
     assert clip.name == name

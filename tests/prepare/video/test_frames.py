@@ -1,8 +1,10 @@
 import contextlib
 import logging
 import socket
+import struct
 import threading
 import tracemalloc
+import zlib
 
 import av
 import numpy as np
@@ -13,7 +15,7 @@ from made_clips import LEFT, RIGHT, UPRIGHT, UPSIDE_DOWN, corners, grey, hold_ph
 from PIL import Image
 
 from twofold.errors import TwofoldError
-from twofold.prepare.video.frames import Frames, describe, natural_order, nearest_in_time, shrunk
+from twofold.prepare.video.frames import Frames, describe, natural_order, nearest_to_steps, shrunk
 
 
 def levels(frames) -> list[int]:
@@ -73,7 +75,7 @@ def test_every_picture_of_an_even_clip_comes_once(tmp_path):
     found = list(frames)
     assert np.allclose(levels(found), shades, atol=3)
     assert [p.source for p in found] == [p.index for p in found] == list(range(24))
-    assert np.allclose([p.seconds for p in found], np.arange(24) / 24)
+    assert np.allclose([p.seconds for p in found], np.arange(24) / 24, atol=1e-3)
     assert (frames.info.fps, frames.info.frames, frames.info.sources) == (24, 24, 24)
     assert frames.info.duration == pytest.approx(1.0)
     assert levels(frames) == levels(found), "a second passage shows the same"
@@ -91,25 +93,63 @@ def test_uneven_clocks_are_followed(tmp_path, ending):
     seconds = np.cumsum([0.0] + [0.04] * 10 + [0.12] * 10)
     path = write_clip(tmp_path / f"vfr.{ending}", [grey(10 * i) for i in range(21)], seconds=seconds)
     found = list(Frames(path, fps=12.5))
-    wanted = [int(np.argmin(np.abs(seconds - 1e-6 - step / 12.5))) for step in range(len(found))]
-    assert [p.source for p in found] == wanted
-    assert found[-1].seconds == pytest.approx(seconds[-1], abs=0.041)
-    assert np.allclose(levels(found), [10 * i for i in wanted], atol=3)
+    wanted = literal_steps(seconds, 12.5)
+    assert [(p.step, p.source) for p in found] == wanted
+    assert np.allclose([p.seconds for p in found], [seconds[source] for _, source in wanted], atol=1e-3)
+    assert np.allclose(levels(found), [10 * source for _, source in wanted], atol=3)
+
+
+def literal_steps(seconds, fps):
+    """Each image to its nearest step; of several at one step the nearest."""
+    taken = {}
+    for source, second in enumerate(seconds):
+        step = int(np.ceil(second * fps - 0.5 - 1e-9))
+        away = abs(second * fps - step)
+        if step not in taken or away < taken[step][0] - 1e-9:
+            taken[step] = (away, source)
+    end = seconds[-1] + (0.5 * (seconds[-1] - seconds[-2]) if len(seconds) > 1 else 0)
+    return [(step, source) for step, (_, source) in sorted(taken.items()) if step / fps <= end + 1e-9]
+
+
+@pytest.mark.parametrize("fps", [None, 7.0, 3.0])
+def test_no_image_of_a_phone_in_dim_light_serves_two_frames(tmp_path, fps):
+    """28 images at gaps of 1 to 3 in a file that states a higher rate than its time stamps show."""
+    gaps = np.tile([1, 1, 2, 1, 3, 1, 1], 4)[:27] / 10
+    seconds = np.concatenate([[0.0], np.cumsum(gaps)])
+    path = write_clip(tmp_path / "dim.mp4", [grey(8 * i) for i in range(28)], fps=25, seconds=seconds)
+    frames = Frames(path, fps)
+    found = list(frames)
+    sources = [p.source for p in found]
+    assert len(set(sources)) == len(sources)
+    assert sources == sorted(sources)
+    assert np.allclose(levels(found), [8 * source for source in sources], atol=3)
+    assert np.allclose([p.seconds for p in found], seconds[sources], atol=1e-3)
+    assert frames.info.sources == 28
+    if fps is None:
+        assert sources == list(range(28))
+        assert frames.info.fps == pytest.approx(27 / gaps.sum(), rel=0.01)
+
+
+def test_the_rate_comes_from_the_time_stamps(tmp_path, monkeypatch):
+    seconds = np.concatenate([[0.0], np.cumsum(np.tile([0.1, 0.2], 10))])
+    path = write_clip(tmp_path / "vfr.mkv", [grey(8 * i) for i in range(21)], fps=25, seconds=seconds)
+    info = describe(path)
+    assert info.fps == pytest.approx(20 / 3.0, rel=1e-3)
+    assert "states 25 frames a second and its time stamps show 6.667" in info.remarks[0]
+    with pytest.raises(TwofoldError, match="7.5 pictures a second were asked for, and vfr.mkv has 6.667"):
+        describe(path, fps=7.5)
 
 
 @given(
     st.lists(st.floats(0.001, 2.0), min_size=0, max_size=30),
     st.floats(0.2, 100.0),
 )
-def test_nearest_in_time_is_a_search(gaps, fps):
+def test_every_item_comes_at_its_nearest_step_or_not_at_all(gaps, fps):
     seconds = np.cumsum([0.0, *gaps])
-    end = seconds[-1] + 0.5 * (seconds[-1] - seconds[-2] if gaps else 0)
-    steps = [k / fps for k in range(int(end * fps + 2)) if k / fps <= end]
-    found = list(nearest_in_time(zip(seconds.tolist(), seconds.tolist(), strict=True), fps))
-    assert len(found) == len(steps)
-    for step, (number, item) in zip(steps, found, strict=True):
-        assert item == seconds[number]
-        assert abs(item - step) <= np.abs(seconds - step).min() + 1e-9
+    found = list(nearest_to_steps(zip(seconds.tolist(), seconds.tolist(), strict=True), fps))
+    assert [(step, number) for step, number, _, _ in found] == literal_steps(seconds, fps)
+    assert len({number for _, number, _, _ in found}) == len(found)
+    assert all(item == when == seconds[number] for _, number, when, item in found)
 
 
 def test_a_clock_that_jumps_makes_no_pictures(tmp_path):
@@ -162,8 +202,46 @@ def test_pictures_of_a_folder_are_turned_and_brought_to_8_bits(tmp_path):
     assert np.array_equal(next(iter(frames)).image, np.rot90(corners(), -1))
 
     (tmp_path / "deep").mkdir()
-    Image.fromarray(np.full((70, 80), 200 * 257, np.uint16)).save(tmp_path / "deep" / "a.png")
+    Image.fromarray(np.full((70, 80), 200 * 257, np.uint16)).save(tmp_path / "deep" / "a.png", exif=exif)
     assert np.all(next(iter(Frames(tmp_path / "deep"))).image == 200)
+    assert next(iter(Frames(tmp_path / "deep"))).image.shape == (80, 70, 3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "white"), [("12 in 16", 4095), ("10 in 16", 1023), ("16", 65535), ("0..1", 1.0), ("0..255", 255.0)]
+)
+def test_images_of_more_than_8_bits_are_as_bright_as_they_were(tmp_path, kind, white):
+    meant = np.tile(np.arange(0, 256, 3, dtype=np.uint8), (70, 1))
+    for number, part in enumerate((meant, meant // 8)):  # The second is a dark image, not another scale
+        values = part / 255 * white
+        stored = values.astype(np.float32) if white in (1.0, 255.0) else values.round().astype(np.uint16)
+        Image.fromarray(stored).save(tmp_path / f"{number}.tiff")
+    frames = Frames(tmp_path)
+    first, second = (picture.image.astype(int) for picture in frames)
+    assert np.abs(first - meant[..., None]).max() <= 1
+    assert np.abs(second - (meant // 8)[..., None]).max() <= 1
+    assert ("is taken as white" in " ".join(frames.remarks)) == (white not in (65535, 1.0))
+
+
+def test_colours_of_12_bits_in_16_are_as_bright_as_they_were(tmp_path):
+    meant = corners(70, 80)
+    (tmp_path / "a.png").write_bytes(png_of_16_bits((meant / 255 * 4095).round().astype(np.uint16)))
+    assert np.array_equal(next(iter(Frames(tmp_path))).image, meant)
+
+
+def png_of_16_bits(colors):
+    """The bytes of a PNG file with 16 bits a channel (ISO/IEC 15948), which Pillow does not write."""
+    height, width, _ = colors.shape
+    lines = b"".join(b"\0" + line.astype(">u2").tobytes() for line in colors)
+    pieces = {
+        b"IHDR": struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0),
+        b"IDAT": zlib.compress(lines),
+        b"IEND": b"",
+    }
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        for kind, content in pieces.items()
+    )
 
 
 def test_natural_order_has_no_ties():
@@ -197,7 +275,7 @@ def test_damage_in_the_middle_is_left_out(tmp_path):
     path.write_bytes(content)
     frames = Frames(path)
     found = list(frames)
-    assert len(found) == 30
+    assert len(found) == 29
     assert [p.source for p in found] == sorted(p.source for p in found)
     assert frames.remarks == ("hurt.mp4 is damaged: 1 pieces could not be decoded and are left out.",)
 

@@ -17,6 +17,9 @@ from twofold.geometry.cameras import Camera
 _CROPPED = 16
 """Video coders pad pictures to multiples of 16 pixels, and players cut that off again, right and below."""
 
+_SAME_SIZE = 1.15
+"""A principal point that is off the middle of the picture by less than this factor is that of its lens."""
+
 
 @dataclass(frozen=True)
 class CalibratedCamera:
@@ -89,7 +92,9 @@ def for_pictures(camera: CalibratedCamera, picture: UInt8[np.ndarray, "h w 3"]) 
     """The camera of a clip whose pictures were cut or resized after the calibration.
 
     In this order: the same size; the same shape, so scaled; scaled with black bars on both sides, which must be seen
-    in `picture`; a few columns or rows less or more, so cut or padded on the right or below, as video coders do.
+    in `picture`; a few columns or rows less or more, so cut or padded on the right or below, as video coders do; scaled
+    and one side rounded to a multiple of 8 or 16, as video coders do too, so that both sides have their own scale.
+    Where the calibration does not say its size, the principal point must be near the middle of the picture.
 
     Args:
         camera: as calibrated.
@@ -100,11 +105,13 @@ def for_pictures(camera: CalibratedCamera, picture: UInt8[np.ndarray, "h w 3"]) 
     """
     height, width = picture.shape[:2]
     if camera.height is None or camera.width is None:
-        cx, cy = camera.intrinsics[:2, 2]
-        if not (0.2 * width < cx < 0.8 * width and 0.2 * height < cy < 0.8 * height):
+        cx, cy = camera.intrinsics[:2, 2].tolist()
+        meant = size_of_principal_point(cx, cy, height, width)
+        if meant is not None:
             raise TwofoldError(
-                f"Camera {camera.name} has its principal point at ({cx:.0f}, {cy:.0f}), far from the middle of its "
-                f"{width}x{height} pictures; give the video in the size it was calibrated in."
+                f"Camera {camera.name} gives no image size; its principal point ({cx:.0f}, {cy:.0f}) is the middle of "
+                f"images of about {meant[1]}x{meant[0]}, and the video has {width}x{height}. Give the video in the size "
+                "it was calibrated in, or add the size to the calibration."
             )
         return replace(camera, height=height, width=width)
     if (height, width) == (camera.height, camera.width):
@@ -118,12 +125,41 @@ def for_pictures(camera: CalibratedCamera, picture: UInt8[np.ndarray, "h w 3"]) 
         return _resized(camera, height, width, (scale, scale), (left, top))
     if max(abs(width - camera.width), abs(height - camera.height)) <= min(_CROPPED, 0.02 * max(height, width)):
         return replace(camera, height=height, width=width)
+    if _rounded(camera, height, width, across, down):
+        return _resized(camera, height, width, (across, down), (0.0, 0.0))
     turned = abs(across * camera.width / camera.height - down * camera.height / camera.width) < 0.02
     raise TwofoldError(
         f"Camera {camera.name} was calibrated for {camera.width}x{camera.height} pictures, its video has "
         f"{width}x{height}; "
         + ("turn the video upright as it was calibrated." if turned else "give the video as it was calibrated.")
     )
+
+
+def size_of_principal_point(cx: float, cy: float, height: int, width: int) -> tuple[int, int] | None:
+    """The size (height, width) of images whose middle the principal point is; None if that is about the size given.
+
+    Lenses have it within a few percent of the middle, and images that were scaled differ by far more.
+
+    >>> size_of_principal_point(639.5, 359.5, 720, 1280)
+    >>> size_of_principal_point(639.5, 359.5, 360, 640)
+    (720, 1280)
+    """
+    meant = 2 * cy + 1, 2 * cx + 1
+    ratios = meant[0] / height, meant[1] / width
+    if all(1 / _SAME_SIZE <= ratio <= _SAME_SIZE for ratio in ratios):
+        return None
+    return round(meant[0]), round(meant[1])
+
+
+def _rounded(camera: CalibratedCamera, height: int, width: int, across: float, down: float) -> bool:
+    """Whether one side is what the other's scale asks for, rounded to a multiple of 8 or 16."""
+    if camera.height is None or camera.width is None:
+        return False
+    for side, exact in ((height, camera.height * across), (width, camera.width * down)):
+        step = 16 if side % 16 == 0 else 8
+        if side % 8 == 0 and abs(side - exact) < step and abs(side - exact) <= 0.05 * side:
+            return True
+    return False
 
 
 def distort(camera: CalibratedCamera, pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:

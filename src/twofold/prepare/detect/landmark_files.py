@@ -8,10 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from twofold.errors import TwofoldError
+from twofold.files import read_json, read_npz
 from twofold.inputs import read_json, shown
 from twofold.npz import read_npz
 from twofold.prepare.detections import LANDMARKS, Track
-from twofold.prepare.video.frames import ClipInfo, files_by_picture, files_with, natural_order
+from twofold.prepare.video.frames import ClipInfo, files_with, natural_order
+from twofold.prepare.video.numbering import numberings
 
 _COCO = (
     "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow",
@@ -42,6 +44,11 @@ NEEDED = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 
 
 def landmarks_from_file(path: Path | str, info: ClipInfo) -> Track:
+    """The likeliest of `landmark_readings`."""
+    return landmark_readings(path, info)[0][1]
+
+
+def landmark_readings(path: Path | str, info: ClipInfo) -> list[tuple[str, Track]]:
     """Landmarks of every picture of a clip as it is before any are left out (`Picture.source`), scaled as they are.
 
     World landmarks are NaN. What is missing is NaN with visibility 0; so are pictures without landmarks.
@@ -55,23 +62,42 @@ def landmarks_from_file(path: Path | str, info: ClipInfo) -> Track:
             Of several people in a picture the largest is taken.
         info: the clip; columns and rows are those of its full size.
 
+    Returns:
+        Each way in which they can belong to the pictures, in words, with the landmarks; the likeliest first.
+
     Raises:
         TwofoldError: it is missing or damaged, of an unknown layout, lacks shoulders or hips, belongs to another clip
             or another size, or counts columns and rows from 0 to 1.
     """
     path = Path(path)
     if path.is_dir():
-        values, names = _from_folder(path, info)
+        found = _from_folder(path, info)
     elif path.suffix.lower() == ".json":
-        values, names = _from_json(path, info)
+        found = _from_json(path, info)
     else:
-        values, names = _from_arrays(read_npz(path, ("landmarks", "names")), path)
-    if abs(len(values) - info.sources) > max(1, info.sources // 50):
-        raise TwofoldError(
-            f"{path} has landmarks of {len(values)} pictures, and the clip has {info.sources}; give them for every one."
-        )
-    _check_place(values, info, path)
-    return _track(values, names, info)
+        found = _shifted(*_from_arrays(read_npz(path, ("landmarks", "names")), path), info)
+    tracks: list[tuple[str, Track]] = []
+    for words, values, names in found:
+        if abs(len(values) - info.sources) > max(1, info.sources // 50):
+            raise TwofoldError(
+                f"{path} has landmarks of {len(values)} pictures, and the clip has {info.sources}; give them for every "
+                "one."
+            )
+        _check_place(values, info, path)
+        tracks.append((words, _track(values, names, info)))
+    return tracks
+
+
+_Reading = tuple[str, Float[np.ndarray, "f k 3"], tuple[str, ...]]
+
+
+def _shifted(values: Float[np.ndarray, "f k 3"], names: tuple[str, ...], info: ClipInfo) -> list[_Reading]:
+    """Rows from the first picture on; where some are missing, they may be missing at the start."""
+    found: list[_Reading] = [("in order from the first image", values, names)]
+    if 0 < (missing := info.sources - len(values)) <= max(1, info.sources // 50):
+        nothing = np.full((missing, *values.shape[1:]), np.nan)
+        found.append(("in order up to the last image", np.concatenate([nothing, values]), names))
+    return found
 
 
 def track_at(track: Track, sources: Sequence[int]) -> Track:
@@ -113,10 +139,10 @@ def _from_arrays(arrays: dict[str, Any], path: Path) -> tuple[Float[np.ndarray, 
     return values, names
 
 
-def _from_json(path: Path, info: ClipInfo) -> tuple[Float[np.ndarray, "f k 3"], tuple[str, ...]]:
+def _from_json(path: Path, info: ClipInfo) -> list[_Reading]:
     content = read_json(path, _MAX_BYTES)
     if isinstance(content, dict):
-        return _from_arrays(content, path)
+        return _shifted(*_from_arrays(content, path), info)
     entries = content if isinstance(content, list) and all(isinstance(e, dict) for e in content) else []
     if not entries or not all("keypoints" in entry and "image_id" in entry for entry in entries):
         raise TwofoldError(f"{path} holds no landmarks in a known form; docs/prepare.md describes those that are read.")
@@ -127,22 +153,27 @@ def _from_json(path: Path, info: ClipInfo) -> tuple[Float[np.ndarray, "f k 3"], 
             raise TwofoldError(f"{path} names a picture {shown(name)}; write the landmarks anew.")
         people.setdefault(name, []).append(entry["keypoints"])
     names = {path / name: name for name in sorted(people, key=natural_order)}
-    places = files_by_picture(list(names), info, "pictures with landmarks")
-    return _assembled({place: people[names[file]] for place, file in places.items()}, info, path)
+    return [
+        (n.words, *_assembled({place: people[names[file]] for place, file in n.places.items()}, info, path))
+        for n in numberings(list(names), info, "pictures with landmarks")
+    ]
 
 
-def _from_folder(folder: Path, info: ClipInfo) -> tuple[Float[np.ndarray, "f k 3"], tuple[str, ...]]:
+def _from_folder(folder: Path, info: ClipInfo) -> list[_Reading]:
     files = files_with(folder, (".json",), "JSON files; expected one with landmarks for each picture")
-    seen: dict[int, list[Any]] = {}
-    for place, file in files_by_picture(files, info, "files of landmarks").items():
+    seen: dict[Path, list[Any]] = {}
+    for file in files:
         content = read_json(file)
         people = content.get("people") if isinstance(content, dict) else None
         if not isinstance(people, list) or not all(isinstance(p, dict) and "pose_keypoints_2d" in p for p in people):
             raise TwofoldError(
                 f"{file} has no `people` with `pose_keypoints_2d`, which OpenPose writes; make it again."
             )
-        seen[place] = [person["pose_keypoints_2d"] for person in people]
-    return _assembled(seen, info, folder)
+        seen[file] = [person["pose_keypoints_2d"] for person in people]
+    return [
+        (n.words, *_assembled({place: seen[file] for place, file in n.places.items()}, info, folder))
+        for n in numberings(files, info, "files of landmarks")
+    ]
 
 
 def _assembled(

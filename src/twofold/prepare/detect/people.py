@@ -1,7 +1,8 @@
 """How many people are in view: a clip of several is better refused than fitted to now this one, now that one."""
 
+import contextlib
 import importlib
-from collections.abc import Iterable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,6 +82,17 @@ def count_people(images: Iterable[UInt8[np.ndarray, "_ _ 3"]]) -> People:
     Raises:
         TwofoldError: MediaPipe is not installed.
     """
+    with people_finder() as find:
+        return People(tuple(comparable(find(image)) for image in images))
+
+
+@contextlib.contextmanager
+def people_finder() -> Generator[Callable[[UInt8[np.ndarray, "_ _ 3"]], list[Person]]]:
+    """A function that finds everybody in an image, by MediaPipe's person detector.
+
+    Raises:
+        TwofoldError: MediaPipe is not installed.
+    """
     load_mediapipe()
     solutions: Any = importlib.import_module("mediapipe.python.solution_base")
     kinds = {"people": solutions.PacketDataType.PROTO_LIST}
@@ -88,7 +100,7 @@ def count_people(images: Iterable[UInt8[np.ndarray, "_ _ 3"]]) -> People:
         detector = solutions.SolutionBase(graph_config=_DETECTOR, outputs=["people"], stream_type_hints=kinds)
         detector.process(np.zeros((_HEIGHT, _HEIGHT, 3), np.uint8))
     try:
-        return People(tuple(comparable(find_people(image, detector)) for image in images))
+        yield lambda image: find_people(image, detector)
     finally:
         detector.close()
 

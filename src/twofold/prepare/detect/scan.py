@@ -5,26 +5,30 @@ Memory does not grow with the clip's length but for the landmarks, a few hundred
 
 import io
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 from scipy import ndimage
 
+from twofold.errors import TwofoldError
 from twofold.files import plain_errors
-from twofold.prepare.detect.background import background_shift
+from twofold.prepare.detect.background import Surroundings, background_motion, surroundings_of
+from twofold.prepare.detect.person import Region, around_mask, only
 from twofold.prepare.detections import Estimator, Observation, Track, track_of
+from twofold.prepare.silhouettes import overlap
 from twofold.prepare.video.frames import Picture
 
-_BACKGROUND = 160
-"""Longer side of the small grey pictures by which a moving camera is noticed."""
+_SAMPLES, _VIEWS = 12, 40
+"""Pictures that are kept to count people, and backgrounds that are compared."""
 
 _QUALITY = 95
 """Of the stored pictures; video has lost more already."""
 
 Straighten = Callable[[UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "h w 3"]]
+Own = Callable[[int], UInt8[np.ndarray, "h w"] | None]
 
 
 @dataclass(frozen=True)
@@ -35,17 +39,33 @@ class Watched:
         images: files of the pictures.
         masks: files of the masks, 0 outside .. 255 on the person.
         track: landmarks.
-        sources: which picture of the clip itself each one is.
-        moved: how far the background moves at most, pixels.
+        sources: which picture of the clip itself each one is; none comes twice.
+        seconds: when each was taken.
+        steps: the even step of time that each stands for (`Picture.step`).
+        moved: how far the background moves at most, pixels; None where that cannot be told.
         sample: some pictures spread over the clip.
+        repeated: pictures that show the same as the one before, and are left out.
+        overlaps: of each reading of the user's own masks the IoU with the estimator's, NaN where one is missing; empty
+            unless there are several readings.
     """
 
     images: tuple[Path, ...]
     masks: tuple[Path, ...]
     track: Track
     sources: tuple[int, ...]
-    moved: float
+    seconds: tuple[float, ...]
+    steps: tuple[int, ...]
+    moved: float | None
     sample: tuple[UInt8[np.ndarray, "h w 3"], ...]
+    repeated: int = 0
+    overlaps: tuple[tuple[float, ...], ...] = ()
+
+    def at(self, places: Sequence[int]) -> "Watched":
+        """Only some of the pictures, by their places."""
+        chosen = list(places)
+        track = replace(self.track, **{name: value[chosen] for name, value in vars(self.track).items()})
+        names = ("images", "masks", "sources", "seconds", "steps")
+        return replace(self, track=track, **{name: tuple(getattr(self, name)[i] for i in chosen) for name in names})
 
 
 def watch_clip(
@@ -54,10 +74,11 @@ def watch_clip(
     estimator: Estimator,
     scratch: Path,
     straighten: Straighten | None = None,
-    given: Callable[[int], UInt8[np.ndarray, "h w"] | None] | None = None,
+    given: Sequence[Own] = (),
     show: Callable[[float], None] | None = None,
+    region: Callable[[UInt8[np.ndarray, "h w 3"], int], Region | None] | None = None,
 ) -> Watched:
-    """Looks at every picture of a clip.
+    """Looks at every picture of a clip. One that equals the one before it, as stretched videos have them, is left out.
 
     Args:
         pictures: in order.
@@ -65,50 +86,83 @@ def watch_clip(
         estimator: finds the person.
         scratch: folder for the files.
         straighten: takes the lens's distortion out of a picture.
-        given: the user's own mask of a picture by its `source`, None where there is none; taken as it is.
+        given: the user's own mask of a picture by its `source`, None where there is none; taken as it is. Where several
+            readings are given the estimator's masks are kept, to choose by (`with_masks`).
         show: told the share that is done.
+        region: where the person is in a straightened picture with its `source`, None for anywhere. By default around
+            the user's own mask; where a picture has none, around the last one.
 
     Raises:
         TwofoldError: a picture cannot be read, or the disk refuses.
     """
     images: list[Path] = []
     masks: list[Path] = []
-    sources: list[int] = []
+    sources: list[tuple[int, float, int]] = []
     seen: list[Observation] = []
     sample: list[np.ndarray] = []
-    first: np.ndarray | None = None
-    moved: list[float] = []
-    every = max(1, expected // 12)
+    views: list[Surroundings] = []
+    overlaps: list[tuple[float, ...]] = []
+    before: np.ndarray | None = None
+    around: Region | None = None
+    repeated = 0
     with plain_errors(scratch):
         scratch.mkdir(parents=True, exist_ok=True)
     for picture in pictures:
+        if before is not None and np.array_equal(before, picture.image):
+            repeated += 1
+            continue
+        before = picture.image
         image = picture.image if straighten is None else straighten(picture.image)
-        found = estimator(image, picture.seconds)
-        own = None if given is None else given(picture.source)
-        mask = clean_mask(found.mask) if own is None else own
-        if own is not None and straighten is not None:
-            mask = straighten(np.repeat(own[..., None], 3, 2))[..., 0]
-        stem = f"{picture.index:06d}"
-        images.append(scratch / f"{stem}.jpg")
-        masks.append(scratch / f"{stem}.png")
+        own = [_straight(reading(picture.source), straighten) for reading in given]
+        drawn = [mask for mask in own if mask is not None]
+        if region is not None:
+            around = region(image, picture.source)
+        elif drawn:
+            around = around_mask(np.max(drawn, axis=0))
+        found = estimator(only(image, around), picture.seconds)
+        mask = clean_mask(found.mask)
+        if len(given) > 1:
+            overlaps.append(tuple(np.nan if m is None else overlap(m > 127, mask > 127) for m in own))
+        elif drawn:
+            mask = drawn[0]
+        number = len(images)
+        images.append(scratch / f"{number:06d}.jpg")
+        masks.append(scratch / f"{number:06d}.png")
         with plain_errors(scratch):
             save_picture(images[-1], image, quality=_QUALITY, subsampling=0)
             save_picture(masks[-1], mask, compress_level=1)
         # The mask is a file now; keeping it would fill the memory.
         seen.append(Observation(found.pixels, found.visibility, found.world, np.zeros((1, 1), np.uint8)))
-        sources.append(picture.source)
-        if picture.index % every == 0:
+        sources.append((picture.source, picture.seconds, picture.step))
+        if number % max(1, expected // _SAMPLES) == 0:
             sample.append(image)
-            small, person, scale = _small(image, mask)
-            if first is None:
-                first = small
-            else:
-                moved.append(scale * background_shift(first, small, person))
+        if number % max(1, expected // _VIEWS) == 0:
+            views.append(surroundings_of(image, mask))
         if show is not None:
             show(min(1.0, (picture.index + 1) / max(expected, 1)))
-    # A single wrong guess about the shift is no moving camera.
-    shift = float(np.quantile(moved, 0.8)) if moved else 0.0
-    return Watched(tuple(images), tuple(masks), track_of(seen), tuple(sources), shift, tuple(sample))
+    if not images:
+        raise TwofoldError("A clip without any picture cannot be prepared; choose another.")
+    places, seconds, steps = zip(*sources, strict=True)
+    return Watched(
+        tuple(images), tuple(masks), track_of(seen), places, seconds, steps, background_motion(views).moved,
+        tuple(sample), repeated, tuple(zip(*overlaps, strict=True)),
+    )  # fmt: skip
+
+
+def with_masks(watched: Watched, given: Own, straighten: Straighten | None = None) -> Watched:
+    """The user's own masks in place of the estimator's, where there are any; the files are written anew."""
+    for path, source in zip(watched.masks, watched.sources, strict=True):
+        mask = _straight(given(source), straighten)
+        if mask is not None:
+            with plain_errors(path.parent):
+                save_picture(path, mask, compress_level=1)
+    return watched
+
+
+def _straight(mask: UInt8[np.ndarray, "h w"] | None, straighten: Straighten | None) -> UInt8[np.ndarray, "h w"] | None:
+    if mask is None or straighten is None:
+        return mask
+    return np.ascontiguousarray(straighten(np.repeat(mask[..., None], 3, 2))[..., 0])
 
 
 def save_picture(path: Path, pixels: UInt8[np.ndarray, "h w *c"], **options: int) -> None:
@@ -132,18 +186,6 @@ def clean_mask(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     reach = ndimage.binary_dilation(filled, iterations=3)
     steep = np.where(filled & ~person, 255, np.where(reach, steep, 0))
     return np.where(filled, np.maximum(steep, 128), np.minimum(steep, 127)).astype(np.uint8)
-
-
-def _small(
-    image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]
-) -> tuple[Float[np.ndarray, "a b"], np.ndarray, float]:
-    """A small grey picture, where the person is in it (with a margin), and how many pixels one of its pixels is."""
-    height, width = mask.shape
-    scale = max(1.0, max(height, width) / _BACKGROUND)
-    size = (round(width / scale), round(height / scale))
-    grey = Image.fromarray(image).convert("L").resize(size, Image.Resampling.BOX)
-    person = np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX)) > 16
-    return np.asarray(grey) / np.float32(255), np.asarray(ndimage.binary_dilation(person, iterations=4)), scale
 
 
 def spread_out(count: int, most: int) -> Sequence[int]:

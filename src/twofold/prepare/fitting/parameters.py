@@ -98,6 +98,11 @@ class Chosen:
     weights: Float[Tensor, "*t n 24"]
 
 
+def root_of(body: Body, betas: Float[Tensor, "S"]) -> Float[Tensor, "3"]:
+    """Rest position of the root joint of this shape, metres."""
+    return body.joints[0] + body.joint_basis[0, :, : len(betas)] @ betas
+
+
 def choose(body: Body, index: Int[Tensor, "*t n"]) -> Chosen:
     """Vertices by their numbers."""
     return Chosen(index, body.weights[index])

@@ -1,6 +1,7 @@
 """Poses that the user has: of every picture of a clip, relative to the T-pose of the body that is taken."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,16 +46,25 @@ def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], bo
     if places.shape != (frames, 3):
         shape = " x ".join(map(str, places.shape))
         raise TwofoldError(f"{path}: {frames} poses need translations of {frames} x 3; they are {shape}.")
-    if frames <= max(sources) or abs(frames - info.sources) > max(1, info.sources // 50):
+    if not info.sources <= frames <= info.sources + max(1, info.sources // 50):
         raise TwofoldError(
             f"{path} has poses of {frames} pictures, and the clip has {info.sources}; give one for every picture."
         )
-    chosen = torch.tensor(list(sources))
-    pose = torch.from_numpy(poses.reshape(frames, _JOINTS, 3)).float()[chosen]
-    return Motion(
-        guess=axis_angle_to_matrix(pose[:, 0]), root=torch.zeros(len(chosen), 3), pose=pose[:, 1:],
-        translation=torch.from_numpy(places).float()[chosen], betas=_betas(arrays, body, path),
+    pose = torch.from_numpy(poses.reshape(frames, _JOINTS, 3)).float()
+    motion = Motion(
+        guess=axis_angle_to_matrix(pose[:, 0]), root=torch.zeros(frames, 3), pose=pose[:, 1:],
+        translation=torch.from_numpy(places).float(), betas=_betas(arrays, body, path),
         marks=torch.zeros(33, 3), log_focal=torch.zeros(()), log_distance=torch.zeros(()),
+    )  # fmt: skip
+    return motion_at(motion, sources)
+
+
+def motion_at(motion: Motion, sources: Sequence[int]) -> Motion:
+    """The motion at some moments, by their numbers."""
+    chosen = torch.tensor(list(sources))
+    return replace(
+        motion, guess=motion.guess[chosen], root=motion.root[chosen], pose=motion.pose[chosen],
+        translation=motion.translation[chosen],
     )  # fmt: skip
 
 

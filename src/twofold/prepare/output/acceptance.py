@@ -1,36 +1,32 @@
 """How well the fitted body agrees with each picture, which pictures to leave out, and when a clip cannot work."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from twofold.capture.layout import spans
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
-from twofold.geometry.rotations import axis_angle_to_matrix
+from twofold.prepare.detect.background import MOVING
 from twofold.prepare.detections import LANDMARKS, Track
+from twofold.prepare.silhouettes import LEAST_IOU, MOST_BAD
+from twofold.prepare.turning import FULL_TURN
 
-LEAST_IOU, MOST_REPROJECTION, LEAST_VISIBILITY = 0.7, 4.0, 0.5
-"""A picture below, above, below these is left out: measured on real clips, failed fits lie well beyond."""
-
-MOST_BAD = 0.3
-"""A clip with a larger share of bad pictures is refused."""
+MOST_REPROJECTION, LEAST_VISIBILITY = 4.0, 0.5
+"""A picture above, below these is left out: measured on real clips, failed fits lie well beyond."""
 
 LEAST_PICTURES = 12
 """Fewer show too little of a person to learn how it moves."""
-
-FULL_TURN = 180.0
-"""A body that turns through less, in degrees, has a side that no picture shows."""
 
 LARGER = "film one whole person, well lit and large enough, and try again"
 FARTHER = "film from farther away, so that the whole body stays in view"
 STEADIER = "film one person who stays in full view, without quick turns"
 """What to do about a film that is itself at fault."""
+
+DROPPED = "asked for with --drop"
 
 _ENDS = ("nose", "left_ankle", "right_ankle", "left_wrist", "right_wrist")
 
@@ -164,56 +160,48 @@ def require_whole(qualities: Sequence[PictureQuality], clip: str, advice: str = 
         )
 
 
-def kept_times(qualities: Sequence[PictureQuality], clip: str, advice: str = STEADIER) -> list[int]:
-    """Moments at which no camera's picture is bad.
+def kept_times(
+    qualities: Sequence[PictureQuality], clip: str, advice: str = STEADIER, drop: Sequence[int] = ()
+) -> tuple[list[int], dict[int, str]]:
+    """Moments at which no camera's picture is bad, and why each other one is left out.
 
     Args:
         qualities: of all pictures.
         clip: for the message.
         advice: what to do, to end it.
+        drop: moments that the user wants left out; these do not count as bad.
 
     Raises:
-        TwofoldError: too many are bad, with the commonest reasons.
+        TwofoldError: too many are bad, with the commonest reasons; or fewer than two are left.
     """
-    faults: dict[int, str] = {}
+    reasons = dict.fromkeys(drop, DROPPED)
     for quality in qualities:
         if quality.fault:
-            faults.setdefault(quality.time, quality.fault)
+            reasons.setdefault(quality.time, quality.fault)
     times = sorted({quality.time for quality in qualities})
+    faults = {time: reason for time, reason in reasons.items() if reason != DROPPED}
     if len(faults) > MOST_BAD * len(times):
         example = min(faults)
         raise TwofoldError(
             f"{len(faults)} of {len(times)} pictures of {clip} could not be understood (moments {spans(faults)}); at "
             f"{example}, for one, {faults[example]}; {advice}."
         )
-    return [time for time in times if time not in faults]
+    kept = [time for time in times if time not in reasons]
+    if len(kept) < 3:
+        raise TwofoldError(f"--drop leaves {len(kept)} pictures of {clip}; leave out fewer.")
+    return kept, reasons
 
 
-def yaw_range(pose: Float[Tensor, "t 24 3"], camera: Camera) -> float:
-    """Through how many degrees the body is seen turned about its own upright axis by one camera, 0..360.
-
-    The largest arc that no picture shows, of all directions the body faces, is taken from the full circle.
-    """
-    facing = axis_angle_to_matrix(pose[:, 0])[:, :, 2] @ camera.world_to_camera[:3, :3].T
-    up = axis_angle_to_matrix(pose[:, 0])[:, :, 1].mean(0) @ camera.world_to_camera[:3, :3].T
-    up = up / up.norm()
-    toward = torch.tensor([0.0, 0.0, -1.0]).to(up)
-    first = toward - (toward @ up) * up
-    first = first / first.norm().clamp_min(1e-6)
-    second = torch.linalg.cross(up, first)
-    angles = torch.atan2(facing @ second, facing @ first).sort().values
-    gaps = torch.diff(angles, append=angles[:1] + 2 * torch.pi)
-    return float(360 - gaps.max() * 180 / torch.pi)
-
-
-def warnings_about(yaw: float, moved: float, width: int, dropped: Sequence[int], several: bool) -> list[str]:
+def warnings_about(
+    yaw: float, moved: float | None, width: int, left_out: Mapping[int, str], several: bool
+) -> list[str]:
     """What a user should know although the clip works.
 
     Args:
-        yaw: from `yaw_range`, over the training camera.
-        moved: how far the background moves, pixels.
+        yaw: from `turning.arc`, over the training camera.
+        moved: how far the background moves, pixels; None where that cannot be told.
         width: of the pictures.
-        dropped: moments left out.
+        left_out: moments left out, and why.
         several: more than one camera saw the person, so that one camera's yaw says less.
     """
     words: list[str] = []
@@ -222,7 +210,7 @@ def warnings_about(yaw: float, moved: float, width: int, dropped: Sequence[int],
             f"The body turns through only {yaw:.0f} degrees before the training camera; unseen sides are made up. "
             "Film a full turn for a back that is true."
         )
-    if moved > 0.01 * width and not several:
+    if moved is not None and moved > MOVING * width and not several:
         words.append(
             f"The background moves by up to {moved:.0f} pixels: the camera does not stand still. Everything is told "
             "relative to it, so the person seems to sway; put the camera on something firm."
@@ -232,6 +220,18 @@ def warnings_about(yaw: float, moved: float, width: int, dropped: Sequence[int],
             "Several cameras agree on these poses; the one that trains cannot see their depth. Train with "
             "--set training.rate_pose=1e-4, so that they move little."
         )
-    if dropped:
-        words.append(f"{len(dropped)} moments were left out: {spans(dropped)}.")
+    if left_out:
+        words.append(f"{len(left_out)} moments were left out: {reasons_in_words(left_out)}.")
     return words
+
+
+def reasons_in_words(left_out: Mapping[int, str]) -> str:
+    """Moments by why they are left out; what was measured at one of them stands for all.
+
+    >>> reasons_in_words({3: "nobody was found", 5: "nobody was found", 4: "too blurred (0.2)"})
+    '3, 5 (nobody was found); 4 (too blurred)'
+    """
+    groups: dict[str, list[int]] = {}
+    for time, reason in sorted(left_out.items()):
+        groups.setdefault(reason.split(" (")[0], []).append(time)
+    return "; ".join(f"{spans(times)} ({reason})" for reason, times in groups.items())

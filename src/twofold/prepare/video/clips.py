@@ -1,5 +1,6 @@
 """The clips that a capture is made from, each with the camera that took it."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from twofold.capture.layout import intrinsics_faults
 from twofold.errors import TwofoldError
@@ -17,12 +19,19 @@ from twofold.prepare.cameras.calibration import (
     largest_distortion,
     match_cameras,
     pinhole,
+    size_of_principal_point,
 )
 from twofold.prepare.cameras.calibration_files import read_calibration
 from twofold.prepare.video.frames import ClipInfo, Frames
 
+Choice = Literal["largest", "masks"] | int
+"""The largest person of the first image, the one that the user's own masks show, or the N-th from the left."""
+
 FOCAL_GUESS = 1.1
 """Times the longer side of a picture: between a phone's wide lens and a camera's usual one."""
+
+_SAME_RATE = 1.01
+"""Rates that differ by less are the same: time stamps are rounded."""
 
 _LENS_MATTERS = 0.5
 """Pictures are straightened where the lens moves a point by more pixels than this."""
@@ -45,6 +54,9 @@ class PrepareConfig:
         landmarks: likewise.
         poses: likewise; nothing is fitted then.
         several_people: whether a second person in view ends it.
+        person: which of several people is meant; None for whom the user's own masks, landmarks or poses show, else for
+            the only one.
+        drop: moments that are left out of the splits.
     """
 
     fps: float | None = None
@@ -59,13 +71,16 @@ class PrepareConfig:
     landmarks: Path | None = None
     poses: Path | None = None
     several_people: Literal["refuse", "ignore"] = "refuse"
+    person: Choice | None = None
+    drop: tuple[int, ...] = ()
 
 
 _HINTS = {
     "masks": "is each white on the person of its own picture?",
     "landmarks": "are they of this clip, in pixels of its full size?",
     "poses": "are they of this clip and body, in metres and radians, before the camera?",
-    "calibration": "do its cameras' names go with the videos', and is it of this recording?",
+    "calibration": "do its cameras' names go with the videos', and is it of this recording and of images of this size?",
+    "intrinsics": "are they of this camera, in pixels of the video's full size?",
 }
 """What to ask about each piece of the user's own."""
 
@@ -81,7 +96,11 @@ def advice(config: PrepareConfig, film: str, pieces: Sequence[str] = tuple(_HINT
     given = [(piece, getattr(config, piece)) for piece in pieces if getattr(config, piece) is not None]
     if not given:
         return film
-    return "the likeliest cause is " + ", or ".join(f"--{piece} {path} ({_HINTS[piece]})" for piece, path in given)
+    words = [
+        f"--{piece} {','.join(f'{n:g}' for n in value) if isinstance(value, tuple) else value} ({_HINTS[piece]})"
+        for piece, value in given
+    ]
+    return "the likeliest cause is " + ", or ".join(words)
 
 
 @dataclass(frozen=True)
@@ -125,6 +144,25 @@ def read_intrinsics(text: str | None) -> tuple[float, float, float, float] | Non
     return fx, fy, cx, cy
 
 
+def read_frames(text: str | None) -> tuple[int, ...]:
+    """Frame numbers from a list with ranges.
+
+    >>> read_frames("3,7-9")
+    (3, 7, 8, 9)
+
+    Raises:
+        TwofoldError: that is not what it says.
+    """
+    numbers: set[int] = set()
+    for part in (text or "").replace(" ", "").split(",") if text else []:
+        match = re.fullmatch(r"([0-9]{1,9})(?:-([0-9]{1,9}))?", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if first > last or last - first > 1_000_000:
+            raise TwofoldError(f"--drop should list frames and ranges of them, such as 3,7-9; it is {text!r}.")
+        numbers |= set(range(first, last + 1))
+    return tuple(sorted(numbers))
+
+
 def _require_lens(lens: tuple[float, float, float, float]) -> None:
     if not (np.isfinite(lens).all() and min(lens[:2]) > 0):
         given = ",".join(f"{number:g}" for number in lens)
@@ -152,6 +190,13 @@ def require_options(clips: Sequence[Path], config: PrepareConfig) -> None:
             raise TwofoldError(
                 "--intrinsics and --calibration were both given; the calibration has them, take it alone."
             )
+    names = clip_names(clips)
+    if config.train_camera is not None and config.train_camera not in names:
+        raise TwofoldError(f"--train-camera {config.train_camera} is none of the clips; they are {', '.join(names)}.")
+    if config.person == "masks" and config.masks is None:
+        raise TwofoldError("--person masks takes the person in your own masks; give them with --masks, too.")
+    if isinstance(config.person, int) and config.person < 1:
+        raise TwofoldError(f"--person counts people from the left, from 1; it is {config.person}.")
     if config.held_out < 3:
         raise TwofoldError(
             f"One moment of {config.held_out} cannot be held out between two that train; take 3 or more."
@@ -164,34 +209,54 @@ def open_clips(clips: Sequence[Path], config: PrepareConfig) -> list[Clip]:
     Raises:
         TwofoldError: a clip or the calibration cannot be read, or they do not go together.
     """
-    names = [clip.stem if clip.is_file() else clip.name for clip in clips]
     lenses: list[CalibratedCamera] | None = None
     if config.calibration is not None:
-        lenses = match_cameras(read_calibration(config.calibration), names)
+        lenses = match_cameras(read_calibration(config.calibration), [_stem(clip) for clip in clips])
     ready: list[Clip] = []
-    for k, (name, clip) in enumerate(zip(names, clips, strict=True)):
-        frames = Frames(clip, config.fps, config.max_size)
+    for k, (name, clip) in enumerate(zip(clip_names(clips), clips, strict=True)):
+        frames = Frames(clip, config.fps, config.max_size, even=len(clips) > 1)
         info = frames.info
         if lenses is None:
-            ready.append(Clip(_folder_name(name), clip, frames, info, _guessed(info, config), None, None))
+            ready.append(Clip(name, clip, frames, info, _guessed(info, config), None, None))
             continue
         lens = for_pictures(lenses[k], next(iter(Frames(clip, config.fps))).image)
         small = _smaller(lens, info)
         straight = largest_distortion(small, info.height, info.width) <= _LENS_MATTERS
         camera = small.without_distortion()
         seen = pinhole(camera, info.height, info.width)
-        ready.append(Clip(_folder_name(name), clip, frames, info, seen, None if straight else small, camera))
-    rates = {round(clip.info.fps, 2) for clip in ready}
-    if len(rates) > 1:
+        ready.append(Clip(name, clip, frames, info, seen, None if straight else small, camera))
+    rates = [clip.info.fps for clip in ready]
+    if max(rates) > _SAME_RATE * min(rates):
         words = ", ".join(f"{clip.name} {clip.info.fps:.4g}" for clip in ready)
         raise TwofoldError(f"The videos have different frame rates ({words}); give one that all reach with --fps.")
+    frames = min(clip.info.frames for clip in ready)
+    if beyond := [time for time in config.drop if not 0 <= time < frames]:
+        raise TwofoldError(
+            f"--drop names frame {beyond[0]}, and {ready[0].path.name} has {frames}, counted from 0; correct the list."
+        )
     return ready
 
 
-def _folder_name(name: str) -> str:
-    """A camera's name out of a file's: letters, digits, '_', '-' and '.' only."""
-    kept = "".join(c if c.isascii() and (c.isalnum() or c in "_-.") else "_" for c in name).lstrip("-.")
-    return kept or "cam"
+def rate_of(seconds: Float[np.ndarray, "t"], fps: float) -> float:
+    """Moments per second: `fps` if their times agree with it, else what these are on average.
+
+    >>> rate_of(np.array([0.0, 0.1, 0.2]), 10.0), rate_of(np.array([0.0, 0.1, 0.4]), 10.0)
+    (10.0, 5.0)
+    """
+    if len(seconds) < 2 or seconds[-1] <= seconds[0]:
+        return fps
+    measured = float((len(seconds) - 1) / (seconds[-1] - seconds[0]))
+    return fps if 1 / _SAME_RATE <= measured / fps <= _SAME_RATE else measured
+
+
+def _stem(clip: Path) -> str:
+    return clip.stem if clip.is_file() else clip.name
+
+
+def clip_names(clips: Sequence[Path]) -> list[str]:
+    """Cameras' names out of the clips': letters, digits, '_', '-' and '.' only."""
+    kept = ["".join(c if c.isascii() and (c.isalnum() or c in "_-.") else "_" for c in _stem(clip)) for clip in clips]
+    return [name.lstrip("-.") or "cam" for name in kept]
 
 
 def _guessed(info: ClipInfo, config: PrepareConfig) -> Camera:
@@ -207,6 +272,13 @@ def _guessed(info: ClipInfo, config: PrepareConfig) -> Camera:
     else:
         fx, fy, cx, cy = config.intrinsics
         faults = intrinsics_faults(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), info.full_width)
+        meant = size_of_principal_point(cx, cy, info.full_height, info.full_width)
+        # Of cropped images the middle is elsewhere, but in no such proportion.
+        if meant is not None and 0.9 < (meant[0] / info.full_height) / (meant[1] / info.full_width) < 1.1:
+            faults.append(
+                f"their principal point is the middle of images of about {meant[1]}x{meant[0]}, and the video has "
+                f"{info.full_width}x{info.full_height}; scale all four to the video's size."
+            )
         if faults:
             raise TwofoldError(f"--intrinsics {fx:g},{fy:g},{cx:g},{cy:g} do not go with the video: {faults[0]}")
         fx, fy, cx, cy = fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5

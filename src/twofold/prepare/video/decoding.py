@@ -20,6 +20,7 @@ from twofold.inputs import is_there, require_file, shown_path
 
 _LONGEST_GAP = 5.0  # Seconds; what is longer is a fault of the file's clock, not a pause.
 _USUAL_RATE = Fraction(25)
+_SAME_RATE = 0.01  # Time stamps are rounded, often to milliseconds: rates that differ by less are the same.
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,8 @@ class VideoInfo:
         width: columns of an upright picture with square pixels.
         height: its rows.
         orientation: how it is brought upright.
-        fps: pictures per second, on average.
-        frames: how many there are, about.
+        fps: pictures per second by their time stamps, on average.
+        frames: how many there are; those that are damaged count.
         duration: seconds, about.
         says_duration: the file itself says how long it is.
         remarks: sentences for the user.
@@ -93,10 +94,7 @@ def describe_video(path: Path) -> VideoInfo:
     """
     with _opened(path) as (container, stream):
         remarks: list[str] = []
-        rate = stream.average_rate or stream.guessed_rate
-        if not rate or not 0.1 <= rate <= 1000:
-            rate = _USUAL_RATE
-            remarks.append(f"{path.name} does not say its frame rate; {rate} a second is taken.")
+        stated = stream.average_rate or stream.guessed_rate
         first = next(_pictures(container, stream, []), None)
         if first is None:
             raise TwofoldError(f"No picture of {path} can be decoded; it is damaged or empty, export it again.")
@@ -113,12 +111,28 @@ def describe_video(path: Path) -> VideoInfo:
             aspect = Fraction(1)
         sides = round(first.width * aspect), first.height
         seconds = _stated_duration(container, stream)
-        frames = stream.frames or round((seconds or 0) * rate)
-    frames = frames or _count(path)
+    frames, measured = _clock(path)
+    rate = _rate(stated, measured, path, remarks)
     width, height = sides[::-1] if turn.transpose else sides
-    return VideoInfo(
-        width, height, turn, float(rate), frames, seconds or float(frames / rate), seconds is not None, tuple(remarks)
-    )
+    return VideoInfo(width, height, turn, rate, frames, seconds or frames / rate, seconds is not None, tuple(remarks))
+
+
+def _rate(stated: Fraction | None, measured: float | None, path: Path, remarks: list[str]) -> float:
+    """Pictures per second: what the file states where its time stamps agree, else what these show."""
+    possible = stated is not None and 0.1 <= stated <= 1000
+    if measured is None or not 0.1 <= measured <= 1000:
+        if possible:
+            return float(stated)
+        remarks.append(f"{path.name} does not say its frame rate; {_USUAL_RATE} a second is taken.")
+        return float(_USUAL_RATE)
+    if possible and abs(measured / float(stated) - 1) <= _SAME_RATE:
+        return float(stated)
+    if possible:
+        remarks.append(
+            f"{path.name} states {float(stated):.4g} frames a second and its time stamps show {measured:.4g} on "
+            "average, which is taken; such videos have a variable frame rate."
+        )
+    return measured
 
 
 def decode(path: Path, info: VideoInfo, remarks: list[str]) -> Generator[tuple[float, av.VideoFrame]]:
@@ -241,8 +255,20 @@ def _stated_duration(container: InputContainer, stream: VideoStream) -> float | 
     return container.duration / 1e6 if container.duration and container.duration > 0 else None
 
 
-def _count(path: Path) -> int:
-    """Pieces of video in a file that does not say how many there are."""
-    with _opened(path) as (container, stream), contextlib.suppress(FFmpegError):
-        return max(sum(packet.size > 0 for packet in container.demux(stream)), 1)
-    return 1
+def _clock(path: Path) -> tuple[int, float | None]:
+    """How many pieces of video there are, and how many a second by their time stamps; nothing is decoded.
+
+    Gaps at which the clock jumps do not count.
+    """
+    stamps: list[float] = []
+    count = 0
+    with _opened(path) as (container, stream), contextlib.suppress(FFmpegError, OSError):
+        for packet in container.demux(stream):
+            if packet.size <= 0 or packet.is_discard:
+                continue
+            count += 1
+            if packet.pts is not None and packet.time_base:
+                stamps.append(float(packet.pts * packet.time_base))
+    gaps = np.diff(np.sort(np.array(stamps)))
+    gaps = gaps[(gaps > 0) & (gaps <= _LONGEST_GAP)]
+    return max(count, 1), len(gaps) / float(gaps.sum()) if len(gaps) else None

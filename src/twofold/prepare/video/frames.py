@@ -1,7 +1,7 @@
 """A video, or a folder of pictures, as upright pictures at even steps of time."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar, final
@@ -11,14 +11,16 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from twofold.errors import TwofoldError
-from twofold.images import load_image, upright_size
+from twofold.images import load_image, read_header, upright_size
 from twofold.prepare.video.decoding import Converter, VideoInfo, decode, describe_video
+from twofold.prepare.video.intensity import deep_values, to_8_bits, white_level
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 USUAL_FPS = 30.0
 """Taken for a folder of pictures, which cannot say it."""
 Item = TypeVar("Item")
 
+_ORIENTATION = 0x0112  # The EXIF field.
 _FASTER = 1.1  # More pictures than a clip has would come twice; clips state their rate only roughly.
 
 
@@ -29,14 +31,15 @@ class ClipInfo:
     Attributes:
         width: columns of each picture.
         height: rows of each picture.
-        fps: pictures per second.
-        frames: how many, about; some files do not say, or say it wrong.
+        fps: pictures per second, on average.
+        frames: how many, about; damaged ones are counted here and do not come.
         duration: seconds, about.
         full_width: columns before pictures are made smaller.
         full_height: rows before pictures are made smaller.
-        sources: how many pictures the clip itself has, about.
+        sources: how many pictures the clip itself has.
         names: what the pictures of a folder are called, without ending; none for a video.
         remarks: a sentence for each thing the user should know.
+        white: the value of white in pictures of a folder (`intensity.white_level`); 255 for a video.
     """
 
     width: int
@@ -49,6 +52,7 @@ class ClipInfo:
     sources: int
     names: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    white: float = 255.0
 
 
 @dataclass(frozen=True)
@@ -57,29 +61,37 @@ class Picture:
 
     Attributes:
         index: how many came before it.
-        seconds: since the first one: index / fps.
+        seconds: when it was taken, since the first one, by its own time stamp.
         image: 8-bit sRGB.
         source: which picture of the clip itself it is, counted from 0 and before any are left out.
+        step: the even step of time (step / fps seconds) that it stands for; grows, with gaps where the clip has no
+            picture near a step.
     """
 
     index: int
     seconds: float
     image: UInt8[np.ndarray, "h w 3"]
     source: int
+    step: int
 
 
 @final
 class Frames:
-    """The pictures of a clip in order, decoded while they are asked for; may be gone through again.
+    """The pictures of a clip in order, each once, decoded while they are asked for; may be gone through again.
 
     Attributes:
         info: what will come.
         remarks: sentences for the user; complete when all pictures have come.
     """
 
-    def __init__(self, clip: Path | str, fps: float | int | None = None, max_size: int | None = None) -> None:
-        """See `describe` for the arguments and errors."""
+    def __init__(
+        self, clip: Path | str, fps: float | int | None = None, max_size: int | None = None, even: bool = False
+    ) -> None:
+        """See `describe` for the arguments and errors; `even` takes the nearest to even steps where no `fps` is given,
+        as clips that are compared with each other need it.
+        """
         self._clip, self._files, self._video, self.info = _look_at(Path(clip), fps, max_size)
+        self._even = even or fps is not None
         self.remarks = self.info.remarks
 
     def __iter__(self) -> Iterator[Picture]:
@@ -91,13 +103,16 @@ class Frames:
         self.remarks = self.info.remarks
         if self._video is None:
             for index, path in enumerate(self._files):
-                yield Picture(index, index / self.info.fps, read_picture(path, self.info), index)
+                yield Picture(index, index / self.info.fps, read_picture(path, self.info), index, index)
             return
         late: list[str] = []
         convert = Converter(self._video, self.info.width, self.info.height)
         timed = decode(self._clip, self._video, late)
-        for index, (source, frame) in enumerate(nearest_in_time(timed, self.info.fps)):
-            yield Picture(index, index / self.info.fps, convert(frame), source)
+        numbered = ((source, source, *found) for source, found in enumerate(timed))
+        for index, (step, source, seconds, frame) in enumerate(
+            nearest_to_steps(timed, self.info.fps) if self._even else numbered
+        ):
+            yield Picture(index, seconds, convert(frame), source, step)
         self.remarks = (*self.info.remarks, *late)
 
 
@@ -107,8 +122,9 @@ def describe(clip: Path | str, fps: float | int | None = None, max_size: int | N
     Args:
         clip: a video in any form that FFmpeg reads, turned upright as it asks for, or a folder of pictures, taken in
             natural order (2 before 10).
-        fps: pictures per second, each the nearest in time; by default a video's average. For a folder: how fast its
-            pictures were taken (30 by default); all of them come.
+        fps: pictures per second; of those nearest to one step of time one comes, and none comes twice. By default all
+            pictures of a video come, at their own times. For a folder: how fast its pictures were taken (30 by
+            default); all of them come.
         max_size: the longer side is made this long at most, in pixels; averaged over areas.
 
     Raises:
@@ -118,26 +134,36 @@ def describe(clip: Path | str, fps: float | int | None = None, max_size: int | N
     return _look_at(Path(clip), fps, max_size)[3]
 
 
-def nearest_in_time(timed: Iterable[tuple[float, Item]], fps: float | int) -> Iterator[tuple[int, Item]]:
-    """What is nearest to 0, 1/fps, 2/fps, ... seconds, with its number; of two as near, the first.
+def nearest_to_steps(timed: Iterable[tuple[float, Item]], fps: float | int) -> Iterator[tuple[int, int, float, Item]]:
+    """For each of the steps 0, 1/fps, 2/fps, ... seconds the nearest of the items that are nearest to this step.
+
+    No item comes twice: a step with no item of its own is left out. Only one item is kept at a time.
 
     Args:
-        timed: seconds, from 0 on and growing, and what is there. Only one of them is kept at a time.
+        timed: seconds, from 0 on and growing, and what is there.
         fps: steps per second. The last step is at most half a gap behind the end.
 
-    >>> list(nearest_in_time([(0.0, "a"), (0.1, "b"), (0.4, "c")], fps=5))
-    [(0, 'a'), (1, 'b'), (2, 'c')]
+    Yields:
+        Step, number of the item, its seconds and the item; of two as near, the first.
+
+    >>> [found[:2] for found in nearest_to_steps([(0.0, "a"), (0.1, "b"), (0.4, "c")], fps=5)]
+    [(0, 0), (1, 1), (2, 2)]
+    >>> [found[:2] for found in nearest_to_steps([(0.0, "a"), (0.6, "b")], fps=5)]
+    [(0, 0), (3, 1)]
     """
-    step, gap, before = 0, 0.0, None
+    best: tuple[int, int, float, Item] | None = None
+    last = gap = 0.0
     for number, (seconds, item) in enumerate(timed):
-        while before is not None and step / fps <= (before[0] + seconds) / 2:
-            yield before[1:]
-            step += 1
-        gap = 0.0 if before is None else seconds - before[0]
-        before = seconds, number, item
-    while before is not None and step / fps <= before[0] + 0.5 * gap:
-        yield before[1:]
-        step += 1
+        step = int(np.ceil(seconds * fps - 0.5 - 1e-9))
+        last, gap = seconds, seconds - last
+        if best is None or step > best[0]:
+            if best is not None:
+                yield best
+            best = step, number, seconds, item
+        elif abs(seconds * fps - step) < abs(best[2] * fps - step) - 1e-9:
+            best = step, number, seconds, item
+    if best is not None and best[0] / fps <= last + 0.5 * gap + 1e-9:
+        yield best
 
 
 def natural_order(name: str) -> tuple[tuple[int, int, str], ...]:
@@ -174,39 +200,6 @@ def files_with(folder: Path, endings: tuple[str, ...], what: str) -> tuple[Path,
     return tuple(sorted(found, key=lambda path: natural_order(path.name)))
 
 
-def files_by_picture(files: Sequence[Path], info: ClipInfo, what: str) -> dict[int, Path]:
-    """Which picture of a clip each file belongs to, counted as `Picture.source` is.
-
-    By name, if the clip is a folder whose pictures are called the same; else by the last number in the name, counted
-    from 0 or 1; else, where there are no such numbers or they are too large, in natural order, one for each picture.
-
-    Args:
-        files: in natural order, all of one folder.
-        info: the clip.
-        what: they are, for the sentences: "masks".
-
-    Raises:
-        TwofoldError: they belong to no picture, or there is another number of them.
-    """
-    places = {name: place for place, name in enumerate(info.names)}
-    if len(places) == len(info.names) and all(path.stem in places for path in files):
-        return {places[path.stem]: path for path in files}
-    slack = max(1, info.sources // 50)  # What a video says of its length is not always right.
-    last_numbers = [re.findall(r"[0-9]+", path.stem)[-1:] for path in files]
-    numbers = [int(found[0]) for found in last_numbers if found]
-    if len(set(numbers)) == len(files):
-        from_one = min(numbers) == 1 or (min(numbers) > 1 and max(numbers) >= info.sources)
-        if max(numbers) - from_one < info.sources + slack:
-            return {number - from_one: path for number, path in zip(numbers, files, strict=True)}
-    if abs(len(files) - info.sources) <= slack:
-        return dict(enumerate(files))
-    numbered = f", numbered from {min(numbers)} to {max(numbers)}" if len(set(numbers)) == len(files) else ""
-    raise TwofoldError(
-        f"{files[0].parent} holds {len(files)} {what}{numbered}, and the clip has {info.sources} pictures; number them "
-        "as its pictures are, from 0, or give one for each."
-    )
-
-
 def picture_size(path: Path) -> tuple[int, int]:
     """Columns and rows of a picture as it is meant to be seen; its pixels are not read.
 
@@ -223,10 +216,12 @@ def read_picture(path: Path, info: ClipInfo) -> UInt8[np.ndarray, "h w 3"]:
         TwofoldError: it cannot be decoded.
     """
     image = load_image(path)
-    upright = ImageOps.exif_transpose(image)
-    if image.mode.startswith("I;16"):  # Pillow would cut off what is brighter than 255.
-        upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
-    upright = upright.convert("RGB")
+    header = read_header(path)
+    if header.deep:  # Pillow would cut off what is brighter than 255, or keep the upper half of the bits.
+        turn = 1 if header.upright else image.getexif().get(_ORIENTATION, 1)
+        image = Image.fromarray(to_8_bits(deep_values(path, header), info.white))
+        image.getexif()[_ORIENTATION] = turn
+    upright = ImageOps.exif_transpose(image).convert("RGB")
     if upright.size != (info.width, info.height):
         upright = upright.resize((info.width, info.height), Image.Resampling.BOX)
     return np.asarray(upright)
@@ -264,7 +259,10 @@ def _look_at(
         rate, names = float(fps or USUAL_FPS), tuple(path.stem for path in files)
         count = len(files)
         small = shrunk(width, height, max_size)
-        return clip, files, None, ClipInfo(*small, rate, count, count / rate, width, height, count, names)
+        white, remarks = white_level(files)
+        return clip, files, None, ClipInfo(
+            *small, rate, count, count / rate, width, height, count, names, tuple(remarks), white
+        )  # fmt: skip
     video = describe_video(clip)
     if fps is not None and fps > _FASTER * video.fps:
         raise TwofoldError(
