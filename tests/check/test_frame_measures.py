@@ -26,9 +26,9 @@ from twofold.check.frame_measures import (
 )
 from twofold.geometry.cameras import project
 from twofold.geometry.raster import rasterize
+from twofold.prepare.silhouettes import overlap
 
 OTHER = [JOINT_NAMES.index(n.replace("left", "x").replace("right", "left").replace("x", "right")) for n in JOINT_NAMES]
-from twofold.prepare.silhouettes import overlap
 
 
 def joints_of(pose):

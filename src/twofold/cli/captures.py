@@ -45,6 +45,8 @@ def import_capture(
     held_out: int = 10,
     drop_below_iou: float = 0.0,
     held_objects: Literal["keep", "remove"] = "remove",
+    fps: float | None = None,
+    credit: str = "",
 ) -> None:
     """Makes a capture folder from one that was prepared elsewhere (images, masks, capture.npz).
 
@@ -53,11 +55,18 @@ def import_capture(
         out: Folder to make.
         held_out: Of so many frames one is kept for testing.
         drop_below_iou: Leaves out frames whose fitted body covers the mask worse than this, 0 to 1.
-        held_objects: Whether a ball or the like that sticks out of or passes in front of the body is taken out.
+        held_objects: Whether a ball or the like that moves apart from the body is taken out of the masks.
+        fps: Frames a second; by default what capture.npz says, else 30.
+        credit: Whom to name when showing the pictures.
     """
     from twofold.prepare.import_fitted import import_prepared
 
-    import_prepared(source, out, held_out, drop_below_iou, held_objects=held_objects)
+    remarks: list[str] = []
+    import_prepared(
+        source, out, held_out, drop_below_iou, held_objects=held_objects, fps=fps, credit=credit, remark=remarks.append
+    )
+    for sentence in remarks:
+        console().print(f"Note: {sentence}", soft_wrap=True)
     say(f"The capture is in {out}.", f"twofold check {out}")
 
 
@@ -95,7 +104,7 @@ def prepare(
         poses: Your own poses of the body, as npz with poses, translations and betas; nothing is fitted then.
         train_camera: Which of several videos trains; by default the first.
         held_out: Of so many moments one is kept for testing.
-        held_objects: Whether a ball or the like is taken out of the masks.
+        held_objects: Whether a ball or the like that moves apart from the body is taken out of the masks.
         several_people: Whether a second person in view ends it, or whoever is found is taken.
         person: Which of several people is meant: the largest, a number (1 is the leftmost in the first image), or the
             one in your own masks; by default the one in your own masks, landmarks or poses.

@@ -85,8 +85,10 @@ def _straightened(track: Track, clip: Clip) -> Track:
 def region_finder(
     given: Given, clip: Clip, body: Body, config: PrepareConfig, finder: Finder
 ) -> Generator[Callable[[UInt8[np.ndarray, "h w 3"], int], Region | None] | None]:
-    """Where the person that is meant is in each image (see `watch_clip`), by the first of: --person, own masks (None,
-    as these are at hand there), own landmarks, own poses; None too where nothing tells.
+    """Where the person that is meant is in each image (see `watch_clip`).
+
+    It is told by the first of: --person, own masks (then None, as these are at hand there), own landmarks, own poses;
+    None too where nothing tells.
     """
     choice = config.person
     with finder() if isinstance(choice, int) or choice == "largest" else nullcontext() as find:

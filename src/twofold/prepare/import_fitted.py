@@ -6,8 +6,8 @@ T-pose. The world is turned from the camera's axes to y up.
 
 import contextlib
 import re
-from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,42 +19,28 @@ from torch import Tensor
 from twofold.body.retarget import convert_pose, straighten
 from twofold.body.skeleton import PARENTS, Body, pose_body, require_surface, shape_body
 from twofold.capture.folder import CaptureWriter
-from twofold.capture.layout import IMAGES, MASKS, file_stem, spans
+from twofold.capture.layout import IMAGES, MASKS, PICTURE_ENDINGS, file_stem, spans
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.upright import turn_world
-from twofold.images import read_grey, read_rgb
+from twofold.images import read_header
 from twofold.npz import are_moderate, read_npz
-from twofold.prepare.output.held_objects import SeenBody, see_body, usual_colors, without_objects
+from twofold.prepare.detect.mask_values import MaskValues, mask_values, read_mask
+from twofold.prepare.output.held_objects import SeenBody, see_body, usual_colors
+from twofold.prepare.output.object_tracks import Sighting, foreign_patches, moving_objects, without
+from twofold.prepare.video.frames import ClipInfo, describe, picture_files, read_picture
+from twofold.prepare.video.numbering import numberings
 
 CAMERA = "cam"
 ARRAYS = "capture.npz"
 _ARRAYS = (
     "intrinsics", "world_to_camera", "poses", "transl", "rest_vertices", "rest_joints", "parents", "weights", "faces",
-    "silhouette_iou", "video_frame",
+    "silhouette_iou", "video_frame", "fps",
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Origin:
-    """Where a capture's pictures come from.
-
-    Attributes:
-        fps: moments per second.
-        credit: whom to name when showing them.
-    """
-
-    fps: float
-    credit: str
-
-
-ORIGINS = {
-    "p2s_cam01": Origin(
-        60.0, "Pictures: demo data of Pose2Sim (BSD-3-Clause), credited to @aaiaueil, Université Gustave Eiffel."
-    ),
-    "sam2_juggle": Origin(8.0, "Pictures: demo gallery of SAM 2, Meta Platforms (Apache-2.0)."),
-}
-"""The captures we know, by the name of their folder."""
+USUAL_FPS = 30.0
+"""Taken where nothing says how fast the frames were taken."""
 
 Y_UP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 """From OpenCV's camera axes (y down, z forward) to a world with y up and z towards the viewer."""
@@ -65,9 +51,11 @@ def import_prepared(
     out: Path | str,
     every_held_out: int = 10,
     drop_below_iou: float = 0.0,
-    origin: Origin | None = None,
     overwrite: bool = False,
     held_objects: Literal["keep", "remove"] = "remove",
+    fps: float | None = None,
+    credit: str = "",
+    remark: Callable[[str], None] = lambda sentence: None,
 ) -> Path:
     """Makes a capture folder from a prepared one. One camera trains; held-out frames become the novel poses.
 
@@ -76,10 +64,12 @@ def import_prepared(
         out: the capture folder to make.
         every_held_out: of so many frames one is held out, the one in the middle, so that its neighbours train.
         drop_below_iou: frames whose fitted body covers the mask worse than this are in no split; the notes name them.
-        origin: frames per second and credit; None takes those of `ORIGINS`, else 30 and no credit.
         overwrite: a capture that lies at `out` gives way.
         held_objects: "remove" takes what is thick and sticks out of the body, such as a ball, out of the masks, and
             marks it and what passes in front of the body as ignored; "keep" leaves the masks as they are.
+        fps: moments per second; None takes `fps` of capture.npz, else 30, and says so.
+        credit: whom to name when showing the pictures.
+        remark: told each sentence that the user should know.
 
     Returns:
         `out`.
@@ -95,30 +85,42 @@ def import_prepared(
         )
     if every_held_out < 3:
         raise TwofoldError(f"One frame of {every_held_out} cannot be held out between two that train; take 3 or more.")
+    if fps is not None and not 0.01 <= fps <= 1000:
+        raise TwofoldError(f"The frame rate {fps:g} makes no sense; give frames per second, 10 for example.")
     arrays = _read_arrays(source)
+    fps = _rate(arrays, fps, remark)
     body, poses, translations = _to_t_pose(arrays)
     kept, left_out = _kept(arrays["silhouette_iou"], drop_below_iou)
-    images, masks = _pictures(source / "images", kept), _pictures(source / "masks", kept)
+    info = _described(source, len(poses), remark)
+    images = _files(picture_files(source / IMAGES), info, kept, source / IMAGES, remark)
+    stems = tuple(images[time].stem for time in kept)
+    named = replace(info, names=stems) if len(stems) == len(poses) else info
+    masks = _files(picture_files(source / MASKS), named, kept, source / MASKS, remark)
+    values = mask_values([masks[time] for time in kept])
+    for sentence in values.remarks:
+        remark(sentence)
     world_to_camera = torch.as_tensor(arrays["world_to_camera"].astype(np.float64))
     poses, translations, world_to_camera = turn_world(Y_UP, body.joints[0], poses, translations, world_to_camera)
-    height, width = _pixels(images[kept[0]], "RGB").shape[:2]
-    camera = Camera(world_to_camera.float(), torch.as_tensor(arrays["intrinsics"].astype(np.float32)), height, width)
+    intrinsics = torch.as_tensor(arrays["intrinsics"].astype(np.float32))
+    camera = Camera(world_to_camera.float(), intrinsics, info.height, info.width)
     held_out = [time for time in kept if time % every_held_out == every_held_out // 2]
-    origin = origin or ORIGINS.get(source.name, Origin(30.0, ""))
     with _named_as_given(images, masks), CaptureWriter(out, overwrite) as writer:
         for time in kept:
-            writer.image_file(CAMERA, time, images[time])
+            _write_image(writer, time, images[time], info)
         shares = dict.fromkeys(kept, 0.0)
         whole = set(kept)
         if held_objects == "remove":
-            for time, mask, hidden, share in _without_objects(body, poses, translations, camera, images, masks):
-                shares[time] = round(share, 3)
-                if hidden.any():
-                    writer.mask(CAMERA, time, mask)
-                    writer.ignored(CAMERA, time, hidden * np.uint8(255))
-                    whole.remove(time)
+            files = _Files(images, masks, info, values)
+            for time, mask, hidden, share in _without_objects(body, poses, translations, camera, files, fps):
+                shares[time] = round(share, 4)
+                writer.mask(CAMERA, time, mask)
+                writer.ignored(CAMERA, time, hidden * np.uint8(255))
+                whole.remove(time)
         for time in sorted(whole):
-            writer.mask_file(CAMERA, time, masks[time])
+            if _as_stored(masks[time], values):
+                writer.mask_file(CAMERA, time, masks[time])
+            else:
+                writer.mask(CAMERA, time, read_mask(masks[time], values))
         writer.finish(
             name=source.name,
             body=body,
@@ -130,8 +132,8 @@ def import_prepared(
                 "train": {CAMERA: [time for time in kept if time not in held_out]},
                 "novel_pose": {CAMERA: held_out},
             },
-            fps=origin.fps,
-            credit=origin.credit,
+            fps=fps,
+            credit=credit,
             notes={
                 "prepared_from": source.name,
                 "every_held_out": every_held_out,
@@ -145,7 +147,61 @@ def import_prepared(
             },
             thorough=True,
         )
+    if any(shares.values()):
+        remark(
+            f"Held objects were taken out in {len(kept) - len(whole)} of {len(kept)} frames, at most "
+            f"{100 * max(shares.values()):.1f} % of the person's mask; --held-objects keep leaves them."
+        )
     return out
+
+
+def _rate(arrays: dict[str, np.ndarray], fps: float | None, remark: Callable[[str], None]) -> float:
+    if fps is None and "fps" in arrays and arrays["fps"].size == 1 and 0.01 <= float(arrays["fps"].item()) <= 1000:
+        fps = float(arrays["fps"].item())
+    if fps is None:
+        remark(f"Nothing says how many frames a second there are; {USUAL_FPS:g} is taken, --fps sets it.")
+    return USUAL_FPS if fps is None else fps
+
+
+def _described(source: Path, frames: int, remark: Callable[[str], None]) -> ClipInfo:
+    """What there is to know of the images, as of a clip's that has one for each pose."""
+    info = describe(source / IMAGES)
+    for sentence in info.remarks:
+        remark(sentence)
+    return replace(info, sources=frames, frames=frames, names=())
+
+
+def _files(
+    files: Sequence[Path], info: ClipInfo, times: Sequence[int], folder: Path, remark: Callable[[str], None]
+) -> dict[int, Path]:
+    """The file of each frame; see `numberings`."""
+    found = numberings(files, info, folder.name)
+    if len(found) > 1:
+        words = found[0].words
+        remark(f"The files in {folder} fit the poses in {len(found)} ways; taken as {words}. Number them from 0.")
+    missing = [time for time in times if time not in found[0].places]
+    if missing:
+        raise TwofoldError(
+            f"{folder} lacks the pictures of frames {spans(missing)} ({missing[0]:04d} and so on); "
+            f"{ARRAYS} has poses for them, so add them or prepare the capture again."
+        )
+    return {time: found[0].places[time] for time in times}
+
+
+def _write_image(writer: CaptureWriter, time: int, file: Path, info: ClipInfo) -> None:
+    header = read_header(file)
+    plain = header.mode in ("RGB", "L") and not header.deep and header.upright
+    if plain and file.suffix.lower() in PICTURE_ENDINGS:
+        writer.image_file(CAMERA, time, file)
+    else:
+        writer.image(CAMERA, time, read_picture(file, info))
+
+
+def _as_stored(file: Path, values: MaskValues) -> bool:
+    """Whether a mask file says what the capture's own do: 8 bits of grey, 255 on the person."""
+    header = read_header(file)
+    plain = header.mode in ("L", "1") and not header.deep and header.upright and not values.labels
+    return plain and file.suffix.lower() in PICTURE_ENDINGS
 
 
 @contextlib.contextmanager
@@ -161,48 +217,64 @@ def _named_as_given(images: dict[int, Path], masks: dict[int, Path]) -> Generato
         raise TwofoldError(text) from error
 
 
+@dataclass(frozen=True)
+class _Files:
+    """Where images and masks lie and what they mean."""
+
+    images: dict[int, Path]
+    masks: dict[int, Path]
+    info: ClipInfo
+    values: MaskValues
+
+    def read(self, time: int) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
+        return read_picture(self.images[time], self.info), read_mask(self.masks[time], self.values)
+
+
 def _without_objects(
     body: Body,
     poses: Float[Tensor, "T 24 3"],
     translations: Float[Tensor, "T 3"],
     camera: Camera,
-    images: dict[int, Path],
-    masks: dict[int, Path],
+    files: _Files,
+    fps: float,
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"], float]]:
-    """Time, mask without held objects, hidden pixels and their share of the mask, where a frame can be judged.
+    """Time, mask without held objects, hidden pixels and their share of the mask, of frames with objects.
 
-    Pictures are read twice, so that a long capture needs no memory for them.
+    Pictures are read several times, so that a long capture needs no memory for them.
     """
     shaped, focal = shape_body(body, torch.zeros(0)), float(camera.intrinsics[0, 0])
-    bodies: dict[int, SeenBody] = {}
-    colors: list[np.ndarray] = []
-    visible: list[np.ndarray] = []
-    for time, image_file in images.items():
+    size = (camera.height, camera.width)
+
+    def see(time: int) -> SeenBody | None:
         posed = pose_body(shaped, poses[time].float(), translations[time].float())
         pixels, depth = project(camera, posed.vertices)
-        image, mask = _pixels(image_file, "RGB"), _pixels(masks[time], "L")
-        size = (camera.height, camera.width)
-        if depth.min() <= 0 or image.shape[:2] != size or mask.shape != size:
+        if depth.min() <= 0:
+            return None
+        return see_body(pixels.numpy(), depth.numpy(), posed.faces.numpy(), focal, *size)
+
+    colors: list[np.ndarray] = []
+    visible: list[np.ndarray] = []
+    times: list[int] = []
+    for time in files.images:
+        image, mask = files.read(time)
+        seen = see(time) if image.shape[:2] == size and mask.shape == size else None
+        if seen is None:
             continue  # The writer tells what is wrong with it.
-        seen = see_body(pixels.numpy(), depth.numpy(), posed.faces.numpy(), focal, *size)
         column, row = np.where(seen.visible[:, None], seen.pixels, 0).T
         colors.append(image[row, column])
         visible.append(seen.visible & (mask[row, column] > 127))
-        bodies[time] = seen
-    if not bodies:
+        times.append(time)
+    if not times:
         return
     usual, trusted = usual_colors(np.stack(colors), np.stack(visible))
-    for time, seen in bodies.items():
-        yield time, *without_objects(_pixels(masks[time], "L"), _pixels(images[time], "RGB"), seen, usual, trusted)
-
-
-def _pixels(file: Path, mode: Literal["L", "RGB"]) -> UInt8[np.ndarray, "h w *c"]:
-    """A picture's bytes.
-
-    Raises:
-        TwofoldError: it cannot be decoded.
-    """
-    return read_grey(file) if mode == "L" else read_rgb(file)
+    sightings: list[Sighting | None] = []
+    for time in times:
+        seen = see(time)
+        image, mask = files.read(time)
+        sightings.append(None if seen is None else foreign_patches(mask, image, seen, usual, trusted))
+    for time, objects in zip(times, moving_objects(sightings, [time / fps for time in times]), strict=True):
+        if objects:
+            yield time, *without(files.read(time)[1], objects)
 
 
 def _read_arrays(source: Path) -> dict[str, np.ndarray]:
@@ -214,6 +286,11 @@ def _read_arrays(source: Path) -> dict[str, np.ndarray]:
     frames, vertices = (len(arrays[n]) if n in arrays and arrays[n].ndim else 0 for n in ("poses", "rest_vertices"))
     arrays.setdefault("silhouette_iou", np.ones(frames))
     arrays.setdefault("video_frame", np.arange(frames))
+    _one_camera(arrays, frames, where)
+    if "parents" in arrays and arrays["parents"].shape == (24,) and arrays["parents"].dtype.kind in "fiu":
+        # The root has no parent: -1, which unsigned numbers hold as their largest one.
+        root = float(arrays["parents"][0])
+        arrays["parents"] = np.array([root if 0 <= root < 24 else -1.0, *arrays["parents"][1:].tolist()])
     faces = arrays["faces"].shape if "faces" in arrays else (0, 3)
     shapes = {
         "intrinsics": (3, 3), "world_to_camera": (4, 4), "poses": (frames, 24, 3), "transl": (frames, 3),
@@ -263,13 +340,15 @@ def _kept(iou: np.ndarray, threshold: float) -> tuple[list[int], list[int]]:
     return kept, np.flatnonzero(iou < threshold).tolist()
 
 
-def _pictures(folder: Path, times: list[int]) -> dict[int, Path]:
-    """The file of each frame, called by its number of four digits."""
-    there = {path.stem: path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
-    missing = [time for time in times if f"{time:04d}" not in there]
-    if missing:
-        raise TwofoldError(
-            f"{folder} lacks the pictures of frames {spans(missing)} ({missing[0]:04d} and so on); "
-            f"{ARRAYS} has poses for them, so add them or prepare the capture again."
-        )
-    return {time: there[f"{time:04d}"] for time in times}
+def _one_camera(arrays: dict[str, np.ndarray], frames: int, where: Path) -> None:
+    """Camera matrices given for each frame become one, where they are all the same."""
+    for name, shape in (("intrinsics", (3, 3)), ("world_to_camera", (4, 4))):
+        given = arrays.get(name)
+        if given is None or given.shape != (frames, *shape) or given.dtype.kind not in "fiu" or not frames:
+            continue
+        if np.abs(given - given[0]).max() > 1e-3 * max(float(np.abs(given[0]).max()), 1.0):
+            raise TwofoldError(
+                f"{name} in {where} change from frame to frame; a capture's camera has one. Bring the images to one "
+                "camera (crop and scale them alike), or take the motion of the camera into poses and transl."
+            )
+        arrays[name] = given[0]

@@ -136,7 +136,7 @@ def test_the_rate_comes_from_the_time_stamps(tmp_path, monkeypatch):
     info = describe(path)
     assert info.fps == pytest.approx(20 / 3.0, rel=1e-3)
     assert "states 25 frames a second and its time stamps show 6.667" in info.remarks[0]
-    with pytest.raises(TwofoldError, match="7.5 pictures a second were asked for, and vfr.mkv has 6.667"):
+    with pytest.raises(TwofoldError, match=r"7\.5 pictures a second were asked for, and vfr\.mkv has 6\.667"):
         describe(path, fps=7.5)
 
 

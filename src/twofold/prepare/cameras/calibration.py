@@ -110,8 +110,8 @@ def for_pictures(camera: CalibratedCamera, picture: UInt8[np.ndarray, "h w 3"]) 
         if meant is not None:
             raise TwofoldError(
                 f"Camera {camera.name} gives no image size; its principal point ({cx:.0f}, {cy:.0f}) is the middle of "
-                f"images of about {meant[1]}x{meant[0]}, and the video has {width}x{height}. Give the video in the size "
-                "it was calibrated in, or add the size to the calibration."
+                f"images of about {meant[1]}x{meant[0]}, and the video has {width}x{height}. Give the video in the "
+                "size it was calibrated in, or add the size to the calibration."
             )
         return replace(camera, height=height, width=width)
     if (height, width) == (camera.height, camera.width):

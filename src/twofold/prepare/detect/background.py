@@ -1,7 +1,7 @@
 """How the background of a camera's images moves: the one measure of a camera that does not stand still.
 
-A shift counts only if it is verified: the backgrounds, laid over each other by it, must look alike. Otherwise nothing is
-known, which is not the same as no motion.
+A shift counts only if it is verified: the backgrounds, laid over each other by it, must look alike. Otherwise nothing
+is known, which is not the same as no motion.
 """
 
 import math

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from twofold.errors import TwofoldError
-from twofold.files import read_json, read_npz
 from twofold.inputs import read_json, shown
 from twofold.npz import read_npz
 from twofold.prepare.detections import LANDMARKS, Track

@@ -164,7 +164,7 @@ def unlikeness(
     return out
 
 
-def objects_in_front(
+def object_mask(
     image: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
     seen: SeenBody,
@@ -214,40 +214,22 @@ def objects_in_front(
     return out
 
 
-def without_objects(
-    mask: UInt8[np.ndarray, "h w"],
-    image: UInt8[np.ndarray, "h w 3"],
-    seen: SeenBody,
-    usual: Float[np.ndarray, "V 3"],
-    trusted: Bool[np.ndarray, "V"],
-    difference: float = 0.25,
-    most: float = 0.25,
-) -> tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"], float]:
-    """A mask without what sticks out of the body, the pixels that objects hide, and their share of the mask.
-
-    What sticks out and has the colours of the body next to it is a limb that is fitted badly; it stays. More than the
-    share `most` is no object but a whole body fitted badly: then the mask stays and nothing is hidden.
+def objects_beside(
+    person: Bool[np.ndarray, "h w"], seen: SeenBody, unlike: Float[np.ndarray, "h w"], difference: float = 0.25
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels that stick out of the body, but for what has the colours of the body next to it: a limb fitted badly.
 
     Args:
-        mask: as estimated, 0..255.
-        image: the picture.
-        seen: the fitted body in it.
-        usual: colours of the body's vertices, 0..1 (`usual_colors`).
-        trusted: which of these are known.
+        person: the mask.
+        seen: the fitted body in the picture.
+        unlike: how far its colours are from the usual ones (`unlikeness`).
         difference: from here on a colour is unlike.
-        most: of the mask.
     """
-    person = mask > 127
-    unlike = unlikeness(image, person, seen, usual, trusted)
     beside = person & ~remove_held_objects(person, seen.silhouette(*person.shape), seen.pixels_per_metre)
     for piece in _pieces(beside):
         if np.median(unlike[piece]) < difference:
             beside[piece] = False
-    hidden = beside | objects_in_front(image, person, seen, unlike, beside, difference)
-    share = float((hidden & person).sum() / max(person.sum(), 1))
-    if share > most:
-        return mask, np.zeros_like(person), share
-    return np.where(beside, 0, mask).astype(np.uint8), hidden, share
+    return beside
 
 
 def _least_difference(

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +21,8 @@ from twofold.prepare.fitting.body_landmarks import body_points
 from twofold.prepare.fitting.outlines import open_mask
 from twofold.prepare.fitting.parameters import Motion, Posed, choose, place_points, pose_motion
 from twofold.prepare.output.acceptance import PictureQuality, picture_quality
-from twofold.prepare.output.held_objects import SeenBody, see_body, usual_colors, without_objects
+from twofold.prepare.output.held_objects import SeenBody, see_body, usual_colors
+from twofold.prepare.output.object_tracks import Patch, Sighting, foreign_patches, moving_objects, without
 from twofold.prepare.silhouettes import overlap, silhouette
 
 _COLOR_SAMPLE = 120
@@ -82,24 +83,28 @@ def compare_with_pictures(
         return see_body(pixels.numpy(), depth.numpy(), faces, focal, camera.height, camera.width)
 
     usual = _usual(watched, see) if held_objects == "remove" else None
+    objects: list[tuple[Patch, ...]] = [()] * len(motion)
     ignored: dict[int, Path] = {}
     removed: dict[int, float] = {}
 
-    def judge(time: int) -> PictureQuality:
+    def look(time: int) -> Sighting | None:
         seen = see(time)
-        mask = open_mask(watched.masks[time])
-        iou = 0.0
-        if seen is not None and (mask > 127).any():
-            if usual is not None:
-                mask, hidden, share = _without_objects(mask, _open_image(watched.images[time]), seen, *usual)
-                if hidden.any():
-                    removed[time] = share
-                    ignored[time] = watched.masks[time].with_suffix(".ignored.png")
-                    with plain_errors(watched.masks[time].parent):
-                        save_picture(watched.masks[time], mask, compress_level=1)
-                        save_picture(ignored[time], hidden * np.uint8(255), compress_level=1)
+        if seen is None or usual is None:
+            return None
+        return foreign_patches(open_mask(watched.masks[time]), read_rgb(watched.images[time]), seen, *usual)
+
+    def judge(time: int) -> PictureQuality:
+        mask, iou = open_mask(watched.masks[time]), 0.0
+        vertices = stand(time)
+        if float(project(camera, vertices)[1].min()) > 0.01 and (mask > 127).any():
+            if objects[time]:
+                mask, hidden, removed[time] = without(mask, objects[time])
+                ignored[time] = watched.masks[time].with_suffix(".ignored.png")
+                with plain_errors(watched.masks[time].parent):
+                    save_picture(watched.masks[time], mask, compress_level=1)
+                    save_picture(ignored[time], hidden * np.uint8(255), compress_level=1)
             counted = None if time not in ignored else open_mask(ignored[time]) == 0
-            iou = overlap(silhouette(camera, stand(time), body.faces), mask > 127, counted)
+            iou = overlap(silhouette(camera, vertices, body.faces), mask > 127, counted)
         track = watched.track
         return picture_quality(
             name, camera, time, iou, shown[time], track.pixels[time], track.visibility[time], size, alone
@@ -108,38 +113,17 @@ def compare_with_pictures(
     qualities: list[PictureQuality] = []
     # Painting, comparing and writing pictures leave the interpreter free most of the time.
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        if usual is not None:
+            sightings: list[Sighting | None] = []
+            for sighting in pool.map(look, range(len(motion))):
+                sightings.append(sighting)
+                show(0.6 * len(sightings) / len(motion))
+            objects = moving_objects(sightings, watched.seconds)
+        start = 0.0 if usual is None else 0.6
         for quality in pool.map(judge, range(len(motion))):
             qualities.append(quality)
-            show(len(qualities) / len(motion))
+            show(start + (1 - start) * len(qualities) / len(motion))
     return Agreement(tuple(qualities), ignored, removed)
-
-
-def _without_objects(
-    mask: UInt8[np.ndarray, "h w"],
-    image: UInt8[np.ndarray, "h w 3"],
-    seen: SeenBody,
-    usual: Float[np.ndarray, "V 3"],
-    trusted: Bool[np.ndarray, "V"],
-) -> tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"], float]:
-    """`without_objects`, looking only at the part of the picture that body and mask take up."""
-    rows, columns = (np.flatnonzero((mask > 127).any(axis)) for axis in (1, 0))
-    down, across = seen.window
-    margin = int(0.15 * seen.pixels_per_metre) + 2
-    top = max(min(down.start, int(rows[0])) - margin, 0)
-    left = max(min(across.start, int(columns[0])) - margin, 0)
-    part = (
-        slice(top, max(down.stop, int(rows[-1]) + 1) + margin),
-        slice(left, max(across.stop, int(columns[-1]) + 1) + margin),
-    )
-    moved = replace(seen, top=(seen.top[0] - top, seen.top[1] - left), pixels=seen.pixels - np.array([left, top]))
-    hidden = np.zeros(mask.shape, dtype=bool)
-    cleaned = mask.copy()
-    cleaned[part], hidden[part], share = without_objects(mask[part], image[part], moved, usual, trusted)
-    return cleaned, hidden, share
-
-
-def _open_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    return read_rgb(path)
 
 
 def _usual(
@@ -153,7 +137,7 @@ def _usual(
         seen = see(time)
         if seen is None:
             continue
-        image, mask = _open_image(watched.images[time]), open_mask(watched.masks[time])
+        image, mask = read_rgb(watched.images[time]), open_mask(watched.masks[time])
         column, row = np.where(seen.visible[:, None], seen.pixels, 0).T
         colors.append(image[row, column])
         visible.append(seen.visible & (mask[row, column] > 127))

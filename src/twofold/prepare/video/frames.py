@@ -87,8 +87,14 @@ class Frames:
     def __init__(
         self, clip: Path | str, fps: float | int | None = None, max_size: int | None = None, even: bool = False
     ) -> None:
-        """See `describe` for the arguments and errors; `even` takes the nearest to even steps where no `fps` is given,
-        as clips that are compared with each other need it.
+        """See `describe` for the other arguments and errors.
+
+        Args:
+            clip: see `describe`.
+            fps: see `describe`.
+            max_size: see `describe`.
+            even: takes the nearest to even steps of time where no `fps` is given, too, as clips need it that are
+                compared with each other.
         """
         self._clip, self._files, self._video, self.info = _look_at(Path(clip), fps, max_size)
         self._even = even or fps is not None
