@@ -90,7 +90,7 @@ def test_a_folder_that_is_none_and_a_number_too_small_are_refused(turner, tmp_pa
     assert checked(capsys, tmp_path / "none")[0] == 2
     code, said = checked(capsys, turner, "--most", 1)
     assert code == 2
-    assert "--most" in said
+    assert "--max-images" in said
 
 
 def test_a_page_cannot_take_the_place_of_a_file(turner, tmp_path, capsys):

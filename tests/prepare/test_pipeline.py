@@ -177,20 +177,22 @@ def test_exchanged_sides_are_put_right_and_noted(tmp_path, monkeypatch):
 
 def test_objects_leave_the_mask_and_are_stored_as_ignored(tmp_path, monkeypatch):
     stage = Stage(tmp_path / "clips", 14)
-    column, row = stage.evidence["cam0"].track.pixels[6, 15].round().astype(int).tolist()
-    box = (column - 2, row - 4, column + 26, row + 24)
-    mask = Image.fromarray(stage.evidence["cam0"].masks[6])
-    ImageDraw.Draw(mask).ellipse(box, fill=255)
-    stage.spoil(6, np.asarray(mask))
-    path = stage.clips[0] / "006.png"
-    with Image.open(path) as picture:
-        image = picture.convert("RGB")
-    ImageDraw.Draw(image).ellipse(box, fill=(20, 240, 30))
-    image.save(path)
+    for time, down in ((5, -16), (6, 0), (7, 16)):
+        column, row = stage.evidence["cam0"].track.pixels[6, 15].round().astype(int).tolist()
+        box = (column - 2, row - 4 + down, column + 26, row + 24 + down)
+        mask = Image.fromarray(stage.evidence["cam0"].masks[time])
+        ImageDraw.Draw(mask).ellipse(box, fill=255)
+        stage.spoil(time, np.asarray(mask))
+        path = stage.clips[0] / f"{time:03d}.png"
+        with Image.open(path) as picture:
+            image = picture.convert("RGB")
+        ImageDraw.Draw(image).ellipse(box, fill=(20, 240, 30))
+        image.save(path)
     stage.is_understood(monkeypatch)
-    stage.prepare(tmp_path / "me", PrepareConfig(held_objects="remove"))
-    assert notes_of(tmp_path / "me")["objects_ignored"] == {"cam0": [6]}
-    assert names(tmp_path / "me" / "ignored" / "cam0") == ["000006.png"]
+    done = stage.prepare(tmp_path / "me", PrepareConfig(held_objects="remove"))
+    assert notes_of(tmp_path / "me")["objects_ignored"] == {"cam0": [5, 6, 7]}
+    assert names(tmp_path / "me" / "ignored" / "cam0") == ["000005.png", "000006.png", "000007.png"]
+    assert "Held objects were taken out in 3 of 14 pictures, at most" in done.summary()
     assert validate(tmp_path / "me") == []
 
 
