@@ -177,7 +177,7 @@ def test_exchanged_sides_are_put_right_and_noted(tmp_path, monkeypatch):
 
 def test_objects_leave_the_mask_and_are_stored_as_ignored(tmp_path, monkeypatch):
     stage = Stage(tmp_path / "clips", 14)
-    for time, down in ((5, -16), (6, 0), (7, 16)):
+    for time, down in ((5, -20), (6, -8), (7, 4)):
         column, row = stage.evidence["cam0"].track.pixels[6, 15].round().astype(int).tolist()
         box = (column - 2, row - 4 + down, column + 26, row + 24 + down)
         mask = Image.fromarray(stage.evidence["cam0"].masks[time])
