@@ -49,7 +49,10 @@ def test_a_link_to_an_endless_device_is_not_read(tmp_path):
 
 def test_folders_and_missing_files_are_called_so(tmp_path):
     assert refusal(read_json, tmp_path) == f"{tmp_path} is a folder, expected a file."
-    assert refusal(read_json, tmp_path / "a.json") == f"{tmp_path / 'a.json'} is missing."
+    assert (
+        refusal(read_json, tmp_path / "a.json")
+        == f"{tmp_path / 'a.json'} is missing; correct the path, or make it again."
+    )
 
 
 def test_a_file_beyond_the_limit_is_not_read(tmp_path):

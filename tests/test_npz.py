@@ -148,3 +148,14 @@ def test_a_bomb_is_seen_before_memory_is_taken(tmp_path):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert "0.125 GiB of arrays" in refusal(tmp_path / "a.npz", limit=2**26)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000
+
+
+@pytest.mark.parametrize(("begins", "called"), [
+    (b"HIERARCHY\nROOT Hips\n{", "a BVH motion"), (b"\xef\xbb\xbf\r\nHIERARCHY", "a BVH motion"),
+    (b"\x80\x04\x95", "a pickle, as WHAM, HumanNeRF"), (b"\x78\x9c\xed", "a pickle"), (b'{"poses": []}', "a JSON file"),
+    (b"\x89HDF\r\n", "an HDF5 or MATLAB file"), (b"", "damaged or no npz file"), (b"PK\x03\x04cut", "damaged"),
+])  # fmt: skip
+def test_files_of_other_programs_are_called_by_their_kind(begins, called, tmp_path):
+    (tmp_path / "motion").write_bytes(begins)
+    with pytest.raises(TwofoldError, match=f"motion is .*{called}"):
+        read_npz(tmp_path / "motion")

@@ -1,4 +1,7 @@
-"""The one kind of error that a user's input can cause."""
+"""The one kind of error that a user's input can cause, and a command that many of them advise."""
+
+import shlex
+from pathlib import Path
 
 
 class TwofoldError(Exception):
@@ -6,3 +9,15 @@ class TwofoldError(Exception):
 
     The command line prints it and exits with code 2. Everything else that is raised is a fault of ours.
     """
+
+
+def install_command(extra: str) -> str:
+    """The command that installs an extra, such as "prepare", for the way in which this program is installed.
+
+    From a clone, pip takes the clone's folder; the name alone works only where a package index knows it.
+    """
+    clone = Path(__file__).resolve().parents[2]
+    if (clone / "pyproject.toml").is_file() and (clone / "constraints.txt").is_file():
+        constraints, source = shlex.quote(str(clone / "constraints.txt")), shlex.quote(f"{clone}[{extra}]")
+        return f"pip install --constraint {constraints} --editable {source}"
+    return f"pip install 'twofold[{extra}]'"

@@ -157,7 +157,7 @@ def why_unreadable(error: OSError | ValueError) -> str:
     if isinstance(error, ValueError):
         return "is no name that a file can have; correct the path"
     if isinstance(error, FileNotFoundError):
-        return "is missing"
+        return "is missing; correct the path, or make it again"
     if isinstance(error, IsADirectoryError):
         return "is a folder, expected a file"
     if isinstance(error, PermissionError):

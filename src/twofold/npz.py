@@ -69,7 +69,31 @@ def read_npz(path: Path | str, wanted: Collection[str] | None = None, limit: int
             raise
         # The archive's own reader has no single error for all that may be wrong with one.
         except _WRONG as error:
+            file.seek(0)
+            kind = foreign_kind(file.read(64))
+            if kind:
+                raise TwofoldError(f"{path} is {kind}.") from error
             raise TwofoldError(f"{path} is damaged or no npz file; make it again.") from error
+
+
+def foreign_kind(begins: bytes) -> str | None:
+    r"""What a file is that begins with these bytes and is no npz file, and what to do; None where nobody knows.
+
+    >>> foreign_kind(b"HIERARCHY\nROOT Hips")
+    'a BVH motion, expected an npz file; save its poses with np.savez'
+    """
+    if begins.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"HIERARCHY"):
+        return "a BVH motion, expected an npz file; save its poses with np.savez"
+    if re.match(rb"\x80[\x02-\x05]|ZF0x|\x78[\x01\x5e\x9c\xda]", begins):
+        return (
+            "a pickle, as WHAM, HumanNeRF and others write them, which may run code and is never opened; save its "
+            "arrays with np.savez, where it was made"
+        )
+    if begins.lstrip().startswith((b"{", b"[")):
+        return "a JSON file, expected an npz file; save its arrays with np.savez"
+    if begins.startswith(b"\x89HDF"):
+        return "an HDF5 or MATLAB file, expected an npz file; save its arrays with np.savez"
+    return None
 
 
 def _read(file: BinaryIO, path: Path | str, wanted: Collection[str] | None, limit: int) -> dict[str, np.ndarray]:

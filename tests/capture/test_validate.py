@@ -113,7 +113,7 @@ def test_a_damaged_body_or_motion_is_named_without_the_path_above(tiny):
     np.savez(tiny / "motion.npz", poses=np.zeros((6, 24, 3)), betas=np.zeros(1))
     assert validate(tiny) == ["body.npz is damaged or no npz file; make it again.", "motion.npz lacks translations."]
     (tiny / "body.npz").unlink()
-    assert "body.npz is missing." in validate(tiny)
+    assert "body.npz is missing; correct the path, or make it again." in validate(tiny)
 
 
 def test_missing_pictures_are_named_by_camera(tiny):

@@ -133,6 +133,12 @@ def test_units_are_recognised_by_the_height(good):
         assert f"by {factor}." in finding.mend
 
 
+def test_a_body_that_hardly_leaves_the_images_is_not_outside_by_nothing(good):
+    cropped = masks(good, 10, borders=("left",))
+    assert "less than 1% of the body is outside" in found(each(cropped, body_outside=0.001), "cropped").what
+    assert "on average 20% of the body is outside" in found(each(cropped, body_outside=0.2), "cropped").what
+
+
 def test_places_are_cameras_and_times(good):
     one = next(f for f in good.frames if f.camera == "side")
     changed = replace(good, frames=tuple(replace(f, iou=0.3) if f is one else f for f in good.frames))

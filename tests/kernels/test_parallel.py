@@ -57,3 +57,35 @@ def test_a_compiled_loop_is_the_plain_one_even_if_something_wraps_it():
     # Without the copy on disk, whose place the test's own file would have to give.
     values = np.arange(5.0)
     assert compiled(checked)(values) == total(values) == 10
+
+
+def triple(x):
+    return 3 * x
+
+
+def test_without_any_folder_to_keep_it_in_a_loop_is_compiled_all_the_same(monkeypatch):
+    """A system's installation that a foreign user runs, in a container say."""
+    monkeypatch.setattr("numba.core.caching.CacheImpl._locator_classes", [])
+    assert compiled(triple)(2.0) == 6.0
+
+
+@pytest.mark.parametrize("method", ["_load_index", "_save_index", "_save_data"])
+def test_a_cache_that_fails_costs_nothing_but_time(method, monkeypatch, tmp_path):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path))
+    kernel = compiled(triple)
+    monkeypatch.setattr(f"numba.core.caching.IndexDataCacheFile.{method}", full)
+    assert kernel(2.0) == 6.0
+
+
+def test_a_damaged_cache_is_compiled_past_and_a_sound_one_is_used(monkeypatch, tmp_path):
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path))
+    assert compiled(triple)(2.0) == 6.0
+    again = compiled(triple)
+    assert again(2.0) == 6.0
+    assert sum(again.stats.cache_hits.values()) == 1
+    for file in tmp_path.rglob("*.nb*"):
+        file.write_bytes(b"junk")
+    assert compiled(triple)(2.0) == 6.0

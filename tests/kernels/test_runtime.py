@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -57,6 +58,24 @@ def test_waiting_threads_give_up_their_core_unless_told_otherwise_or_too_late(gi
     environment |= {} if given is None else {"OMP_WAIT_POLICY": given}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == str(expected)
+
+
+@pytest.mark.parametrize("part", ["common", "step", "rendering", "quality"])
+def test_benchmarks_tell_waiting_threads_to_give_up_their_core_before_torch_is_there(part):
+    code = f"""
+import os, sys
+class Watch:
+    def find_spec(self, name, *_):
+        if name == "torch":
+            print(os.environ.get("OMP_WAIT_POLICY")); sys.stdout.flush(); os._exit(0)
+sys.meta_path.insert(0, Watch())
+import benchmarks.{part}
+"""
+    environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"}
+    root = Path(__file__).resolve().parents[2]
+    environment["PYTHONPATH"] = os.pathsep.join([str(root), environment.get("PYTHONPATH", "")])
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "PASSIVE"
 
 
 def test_the_command_line_loads_torch_only_after_it_is_told_how_to_wait():

@@ -176,7 +176,7 @@ def _masks(facts: Facts) -> Iterator[Finding]:
             graded(outside > CUT_OFF),
             "cropped",
             f"In {counted(len(cropped), 'picture')} the person runs out at the {', '.join(sides)}; on average "
-            f"{outside:.0%} of the body is outside",
+            f"{f'{outside:.0%}' if outside >= 0.005 else 'less than 1%'} of the body is outside",
             "Use pictures that show all of the person; what is never seen is made up.",
             places(cropped),
         )

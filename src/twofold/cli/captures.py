@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from twofold.cli.advice import require_capture, require_fitted
 from twofold.cli.console import bar, console, say, within
 
 
@@ -61,6 +62,7 @@ def import_capture(
     """
     from twofold.prepare.import_fitted import import_prepared
 
+    require_fitted(source)
     remarks: list[str] = []
     import_prepared(
         source, out, held_out, drop_below_iou, held_objects=held_objects, fps=fps, credit=credit, remark=remarks.append
@@ -145,6 +147,7 @@ def check(
     from twofold.check.rules import judge
 
     within(max_images=(max_images, 2, None))
+    require_capture(capture)
     require_no_file(out or capture / "check")
     with bar("Checking") as show:
         facts, read = measure_capture(capture, max_images, lambda done: show(0.9 * done, ""))

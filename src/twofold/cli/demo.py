@@ -1,6 +1,5 @@
 """`twofold demo`: film a made-up person, train, measure, show. The whole idea in three minutes on two cores."""
 
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,11 +7,14 @@ from pathlib import Path
 
 import torch
 
+from twofold import __version__
 from twofold.capture.folder import read_capture
+from twofold.capture.layout import DESCRIPTION
 from twofold.capture.types import Capture, Frame, spread
 from twofold.errors import TwofoldError
 from twofold.evaluation import evaluate, with_protocols
 from twofold.files import plain_errors, write_json
+from twofold.inputs import read_json
 from twofold.methods.base import Avatar
 from twofold.methods.factorized_recipes import quick
 from twofold.metrics.image import to_8bit
@@ -34,10 +36,15 @@ from twofold.report import (
     write_report,
 )
 from twofold.studio.generate import StudioConfig, make_studio
+from twofold.training.lock import locked
 from twofold.training.loop import Progress, train
+from twofold.training.run import CHECKPOINT, RECIPE
 
 SIZE, FRAMES, CAMERAS = 192, 50, 4
 """Of the demo's capture: 40 moments to train on, 10 with another motion, one camera to train on and three to test."""
+
+MARK = "demo.json"
+"""The file by which a demo knows its own folder."""
 
 
 def demo_recipe(seed: int) -> Recipe:
@@ -55,7 +62,7 @@ def run_demo(out: Path, seed: int, show: Callable[[float, str], None]) -> Path:
     """Does it all.
 
     Args:
-        out: folder to make; a demo that lies there gives way.
+        out: folder to make; a demo that lies there is overwritten.
         seed: who is filmed.
         show: told the share that is done and what is being done.
 
@@ -63,11 +70,43 @@ def run_demo(out: Path, seed: int, show: Callable[[float, str], None]) -> Path:
         the page.
 
     Raises:
-        TwofoldError: `out` holds something else, or cannot be written.
+        TwofoldError: `out` holds something else, another demo is being made there, or it cannot be written.
+    """
+    config, recipe = StudioConfig(seed=seed, size=SIZE, frames=FRAMES, cameras=CAMERAS), demo_recipe(seed)
+    _claim(out)
+    with locked(out, "filled"):
+        return _fill(out, seed, config, recipe, show)
+
+
+def _claim(out: Path) -> None:
+    """Makes the folder and marks it as a demo's, so that the next demo knows what it may overwrite.
+
+    Raises:
+        TwofoldError: it holds anything that no demo has made, or cannot be written.
     """
     with plain_errors(out):
-        if out.exists() and any(out.iterdir()) and not (out / "capture" / "capture.json").is_file():
-            raise TwofoldError(f"{out} holds something that is no demo; choose another --out or empty it.")
+        found = {path.name for path in out.iterdir()} if out.exists() else set[str]()
+        # A program that was killed while it wrote the mark leaves its beginning.
+        marked = MARK in found or all(name.startswith(f".{Path(MARK).stem}.partial-") for name in found)
+        if not marked:
+            raise TwofoldError(
+                f"{out} holds files, but no {MARK}, so no demo has made it; choose another --out, or empty it."
+            )
+        for part, file, own in (("capture", DESCRIPTION, "studio"), ("run", RECIPE, "demo")):
+            if (out / part / file).exists() and _maker(read_json(out / part / file)) != own:
+                raise TwofoldError(f"{out / part} is not what a demo has made; move it, or choose another --out.")
+        out.mkdir(parents=True, exist_ok=True)
+    write_json(out / MARK, {"made_by": "twofold demo", "version": __version__})
+
+
+def _maker(stored: object) -> object:
+    """Who has made a capture, by its description's notes; what a run is called, by its recipe."""
+    notes = stored.get("notes", stored) if isinstance(stored, dict) else {}
+    return notes.get("made_by", notes.get("name")) if isinstance(notes, dict) else None
+
+
+def _fill(out: Path, seed: int, config: StudioConfig, recipe: Recipe, show: Callable[[float, str], None]) -> Path:
+    """Films, trains, measures and shows; returns the report."""
     begun = time.monotonic()
     seconds: dict[str, float] = {}
 
@@ -75,14 +114,12 @@ def run_demo(out: Path, seed: int, show: Callable[[float, str], None]) -> Path:
         seconds[name] = time.monotonic() - begun - sum(seconds.values())
 
     show(0.0, "filming a made-up person")
-    config = StudioConfig(seed=seed, size=SIZE, frames=FRAMES, cameras=CAMERAS)
-    shutil.rmtree(out / "capture", ignore_errors=True)
-    make_studio(config, out / "capture", lambda done: show(0.12 * done, "filming a made-up person"))
+    make_studio(config, out / "capture", lambda done: show(0.12 * done, "filming a made-up person"), overwrite=True)
     capture = read_capture(out / "capture")
     lap("studio")
 
     run = out / "run"
-    (run / "checkpoint.safetensors").unlink(missing_ok=True)
+    (run / CHECKPOINT).unlink(missing_ok=True)
     curve: list[tuple[int, float]] = []
 
     def watch(progress: Progress) -> None:
@@ -91,7 +128,7 @@ def run_demo(out: Path, seed: int, show: Callable[[float, str], None]) -> Path:
         share = 0.12 + 0.68 * progress.step / progress.steps
         show(share, f"training, step {progress.step} of {progress.steps}, {progress.psnr:.1f} dB")
 
-    avatar = train(capture, demo_recipe(seed), run, torch.device("cpu"), watch=watch)
+    avatar = train(capture, recipe, run, torch.device("cpu"), watch=watch)
     lap("training")
 
     show(0.8, "measuring")

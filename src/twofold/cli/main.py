@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from twofold import __version__
+from twofold.cli.advice import after_evaluation, after_rendering, require_capture, require_run
 from twofold.cli.captures import check, import_capture, prepare, studio
 from twofold.cli.console import ALONE, bar, console, say, within
 from twofold.cli.exports import export
@@ -68,6 +69,7 @@ def train(
             "--resume continues a run as it was begun; leave --set, --out, --seed and --recipe out, or start a new run."
         )
     else:
+        require_run(resume)
         chosen, folder = read_recipe(resume), resume
         source = find_capture(resume, capture, "twofold train CAPTURE --resume RUN")
     if ALONE:
@@ -113,6 +115,7 @@ def _new_run(
 
     if capture is None:
         raise TwofoldError("Expected a capture folder (`twofold train CAPTURE`) or --resume RUN; neither was given.")
+    require_capture(capture)
     folder = out or Path("runs") / f"{capture.resolve().name}-{recipe}"
     require_free(folder)
     return with_overrides(RECIPES[recipe](), [f"seed={seed}", *overrides]), folder, capture
@@ -155,21 +158,25 @@ def render(
     from twofold.capture.folder import read_capture
     from twofold.files import made_folder
     from twofold.outputs.gallery import render_run
-    from twofold.training.run import choose_device, find_capture, load, require_same
+    from twofold.training.run import choose_device, find_capture, load, read_recipe, require_same
 
     within(size=(size, 16, 4096), chunk=(chunk, 1, None))
+    require_run(run)
     if motion_video.motion is not None:
         render_motion(run, motion_video, size, out, chunk, device)
         return
     if motion_video != NO_MOTION:
         raise TwofoldError("--follow, --fps, --up, --units, --start-at-origin, --background and --alpha need --motion.")
     avatar, _ = load(run, choose_device(device))
-    read = read_capture(find_capture(run, capture))
+    source = find_capture(run, capture)
+    require_capture(source)
+    read = read_capture(source)
     require_same(run, read, motion=False)
     folder = out or run / "renders"
     with made_folder(folder), bar("Drawing") as show:
         render_run(avatar, read, folder, what, size, chunk, lambda done: show(done, ""))
-    say(f"The pictures are in {folder}.", _with_capture(["twofold", "evaluate", str(run)], capture))
+    measure = _with_capture(["twofold", "evaluate", str(run)], capture)
+    say(f"The images are in {folder}.", after_rendering(run, source, measure, read_recipe(run).name))
 
 
 def evaluate(
@@ -190,12 +197,15 @@ def evaluate(
     """
     from twofold.capture.folder import read_capture
     from twofold.evaluation import evaluate as measure
-    from twofold.training.run import choose_device, find_capture, load, require_same
+    from twofold.training.run import choose_device, find_capture, load, read_recipe, require_same
 
     images, meshes = (None if given == "all" else given for given in (max_images, max_meshes))
     within(max_images=(images, 1, None), max_meshes=(meshes, 0, None))
+    require_run(run)
     avatar, _ = load(run, choose_device(device))
-    read = read_capture(find_capture(run, capture))
+    source = find_capture(run, capture)
+    require_capture(source)
+    read = read_capture(source)
     require_same(run, read, motion=True)
     with bar("Measuring") as show:
         metrics = measure(avatar, read, run, images, meshes, show)
@@ -204,7 +214,13 @@ def evaluate(
             numbers = {k: v for k, v in values.items() if isinstance(v, float)}
             line = f"{section}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items())
             console().print(line, soft_wrap=True)
-    say(f"The figures are in {run / 'metrics.json'}.", _with_capture(["twofold", "render", str(run)], capture))
+    sampled = {split: len(read.splits.get(split, ())) for split in ("novel_view", "novel_pose")}
+    if images is not None and max(sampled.values()) > images:
+        counts = ", ".join(f"{min(images, count)} of {count} of {split}" for split, count in sampled.items() if count)
+        note = f"These are means over images that are evenly spread: {counts}; --max-images all measures all."
+        console().print(note, soft_wrap=True)
+    draw = _with_capture(["twofold", "render", str(run)], capture)
+    say(f"The metrics are in {run / 'metrics.json'}.", after_evaluation(run, source, draw, read_recipe(run).name))
 
 
 def _with_capture(words: list[str], capture: Path | None) -> str:

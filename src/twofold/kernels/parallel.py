@@ -1,13 +1,15 @@
 """Compiled loops on several threads: the range is cut into as many parts as PyTorch uses threads."""
 
+import contextlib
 import inspect
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import Any
+from typing import Any, final
 
 import numba
 import torch
+from numba.core.caching import FunctionCache
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -15,7 +17,30 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     A function that another one wraps, as checks of shapes do in the tests, is compiled as it was written.
     """
-    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
+    kernel = numba.njit(nogil=True)(inspect.unwrap(function))
+    # Without any folder to keep results in, numba raises; compiling anew in each process takes some seconds.
+    with contextlib.suppress(RuntimeError, OSError):
+        kernel._cache = _Cache(kernel.py_func)
+    return kernel
+
+
+@final
+class _Cache(FunctionCache):
+    """Results kept on disk as far as that is possible; a cache that cannot be read or written is none."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled function, or None where it has to be compiled."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # A damaged cache fails in any way.
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keeps it, unless the disk refuses."""
+        try:
+            super().save_overload(sig, data)
+        except Exception:  # What cannot be kept, or read to add to it, is compiled again next time.
+            self.disable()
 
 
 @lru_cache(maxsize=4)

@@ -25,6 +25,17 @@ def flush_denormals() -> None:
     torch.set_flush_denormal(True)
 
 
+def wait_passively() -> bool:
+    """Tells OpenMP that waiting threads give up their core; tells whether that is still possible.
+
+    It has to be called before torch is imported, which starts OpenMP. A setting of the user's stays.
+    """
+    if "torch" in sys.modules:
+        return False
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    return True
+
+
 def tune_process() -> None:
     """Threads that wait give up their core, denormals are flushed, and freed memory is kept for the next step.
 
@@ -33,8 +44,7 @@ def tune_process() -> None:
     Memory: glibc returns large blocks to the system and fetches them again zeroed, page by page, at every step.
     Call it before the first parallel operation; elsewhere than on Linux that part is left out.
     """
-    if "torch" not in sys.modules:
-        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    wait_passively()
     flush_denormals()
     if sys.platform != "linux" or "MALLOC_" in "".join(os.environ) or "GLIBC_TUNABLES" in os.environ:
         return

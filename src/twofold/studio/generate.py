@@ -191,13 +191,16 @@ def photograph(
     return picture[..., :3], picture[..., 3]
 
 
-def make_studio(config: StudioConfig, out: Path, progress: Callable[[float], None] | None = None) -> Path:
+def make_studio(
+    config: StudioConfig, out: Path, progress: Callable[[float], None] | None = None, overwrite: bool = False
+) -> Path:
     """Make a capture folder; the same configuration gives the same bytes.
 
     Args:
         config: what to make.
         out: the folder to write; it must not exist, or be empty.
         progress: is told the share done, 0..1.
+        overwrite: a capture in `out` without any other files is overwritten once the new one is complete.
 
     Raises:
         TwofoldError: the free body is not installed, or the folder cannot be written.
@@ -207,7 +210,7 @@ def make_studio(config: StudioConfig, out: Path, progress: Callable[[float], Non
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with CaptureWriter(out) as writer:
+        with CaptureWriter(out, overwrite) as writer:
             performer = cast(config.seed, rehearsed, config.frames - rehearsed)
             cameras = ring(config.cameras, config.size, _outline(performer))
             _film(config, performer, cameras, splits, writer, progress or (lambda _: None))

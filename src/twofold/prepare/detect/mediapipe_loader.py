@@ -7,9 +7,9 @@ import sys
 from collections.abc import Generator
 from types import ModuleType
 
-from twofold.errors import TwofoldError
+from twofold.errors import TwofoldError, install_command
 
-_ADVICE = "install it with `pip install 'twofold[prepare]'`, or give your own landmarks and masks"
+_ADVICE = f"install it with `{install_command('prepare')}`, or give your own landmarks and masks"
 
 
 def load_mediapipe() -> ModuleType:
