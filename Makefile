@@ -11,7 +11,7 @@ export NO_MKDOCS_2_WARNING := true
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all checks pytest docs format benchmarks clean
+.PHONY: help demo test test-all checks pytest docs format benchmarks gpu-bundle clean
 
 help: ## This list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -44,6 +44,9 @@ format: $(VENV)/.ready-all ## Repair what ruff can repair
 
 benchmarks: $(VENV)/.ready-studio ## Measure speed, beside the reference form, on one thread and on all (an hour)
 	$(BIN)/python -m benchmarks
+
+gpu-bundle: $(VENV)/.ready-studio ## What a machine with a GPU and no network needs, in gpu-bundle/ (CAPTURE=folder to choose)
+	$(BIN)/python -m benchmarks.gpu_bundle gpu-bundle $(if $(CAPTURE),--capture $(CAPTURE))
 
 clean: ## Remove what the targets made, .venv included
 	rm -rf $(VENV) site dist build .pytest_cache .ruff_cache .import_linter_cache .hypothesis
