@@ -43,7 +43,7 @@ def pinned(constraints: str, python: tuple[int, int] = (3, 12)) -> dict[str, str
         found = re.match(r'([\w.-]+)==([\w.]+)(?:\s*;\s*python_version\s*(<|>=)\s*"(\d+)\.(\d+)")?', line)
         if found:
             bound = (int(found[4]), int(found[5])) if found[3] else python
-            if found[3] != "<" or python < bound:
+            if (python < bound) == (found[3] == "<"):
                 versions[found[1]] = found[2]
     return versions
 
