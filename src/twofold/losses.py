@@ -329,7 +329,7 @@ def neighbour_distances(
 
 
 def surface_points(sdf: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Mean of max(s, 0) at the points: they shall not lie outside of the surface (NPC)."""
+    """Mean of max(s, 0) at the points: points outside of the surface pull it outwards (NPC)."""
     return sdf.relu().mean()
 
 

@@ -105,7 +105,8 @@ class WeightVolume(nn.Module):
 
     A constant code of 256 numbers goes through a linear layer to 1024 channels and five transposed 3-D convolutions
     (kernel 4, stride 2) to 25 channels of 32^3 logits; LeakyReLU(0.2) between. 63,589,145 parameters, and no input: its
-    result is the same for every pose, so one evaluation serves a whole training step, and rendering for ever.
+    result is the same for every pose, so one evaluation serves a whole training step, and a trained
+    avatar needs none.
     """
 
     log_prior: Tensor

@@ -22,7 +22,7 @@ TWO_HOPS: dict[int, tuple[int, ...]] = {
     13: (6, 9, 13, 14, 16, 18), 14: (6, 9, 13, 14, 17, 19), 15: (9, 13, 14, 15), 16: (9, 13, 16, 18, 20),
     17: (9, 14, 17, 19, 21), 18: (13, 16, 18, 20), 19: (14, 17, 19, 21), 20: (16, 18, 20), 21: (17, 19, 21),
 }  # fmt: skip
-"""For each rigid part, the parts that may move its points or answer for it: two steps along the skeleton (NPC)."""
+"""For each rigid part, the parts that may move its points or are searched too: two steps along the skeleton (NPC)."""
 MIN_SCALE = 0.95
 """A learned half-size does not fall below this fraction of its initial value."""
 WINDOW_SHARPNESS = 2.0

@@ -140,11 +140,11 @@ class ImplicitField(nn.Module):
     def _geometry(self, networks: ReadyBranch, x: Tensor) -> tuple[Geometry, Tensor]:
         encoded = self._encoded(x)
         if self.config.gradients == "analytic":
-            answer, tape = networks.sdf.forward_with_tape(encoded)
-            geometry = Geometry(networks.sdf, encoded, answer[:, 0], answer[:, 1:], tape, None, False)
+            output, tape = networks.sdf.forward_with_tape(encoded)
+            geometry = Geometry(networks.sdf, encoded, output[:, 0], output[:, 1:], tape, None, False)
             return geometry, geometry.pull_sdf()
-        answer = networks.sdf(encoded)
-        geometry = Geometry(networks.sdf, encoded, answer[:, 0], answer[:, 1:], None, None, False)
+        output = networks.sdf(encoded)
+        geometry = Geometry(networks.sdf, encoded, output[:, 0], output[:, 1:], None, None, False)
         (gradient,) = torch.autograd.grad(geometry.sdf.sum(), x, create_graph=self.training, retain_graph=True)
         return geometry, gradient
 

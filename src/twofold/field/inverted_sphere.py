@@ -154,6 +154,6 @@ class InvertedSphereField(nn.Module):
             views: the ray's direction at each point, unit length.
             code: of the frame.
         """
-        answer = self.geometry(fourier_encoding(points, POINT_OCTAVES, include_pi=False), code)
-        seen = torch.cat([fourier_encoding(views, VIEW_OCTAVES, include_pi=False), answer[:, 1:]], -1)
-        return RadianceOutput(density=answer[:, 0].abs(), color=self.color(seen, code).sigmoid())
+        geometry = self.geometry(fourier_encoding(points, POINT_OCTAVES, include_pi=False), code)
+        seen = torch.cat([fourier_encoding(views, VIEW_OCTAVES, include_pi=False), geometry[:, 1:]], -1)
+        return RadianceOutput(density=geometry[:, 0].abs(), color=self.color(seen, code).sigmoid())

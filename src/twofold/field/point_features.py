@@ -1,4 +1,4 @@
-"""What NPC's points tell a query point of observation space, and the network that makes distance and colour of it."""
+"""NPC's features at query points of observation space, and the networks from these to distance and colour."""
 
 from dataclasses import dataclass
 
@@ -150,7 +150,7 @@ class PointFeatures(nn.Module):
         Args:
             queries: world, metres.
             views: unit view directions.
-            nearest: point numbers from `nearest_posed_points`; each answers with its neighbours of the rest pose.
+            nearest: point numbers from `nearest_posed_points`; their neighbours of the rest pose are blended.
             cloud: the points.
             posed: the points in the pose.
             tables: from `tables`.

@@ -114,7 +114,7 @@ class PointCloud(nn.Module):
         positions: box coordinates of the points.
         joints: of the rest pose, metres.
         half_sizes: of all 24 boxes, metres; they stay as DANBO left them.
-        neighbours: how many nearest points of the rest pose, the point itself among them, answer together.
+        neighbours: how many nearest points of the rest pose, the point itself among them, are blended.
         generator: draws the features.
     """
 

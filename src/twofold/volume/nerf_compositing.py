@@ -65,7 +65,7 @@ def open_density_weights(
 ) -> Float[Tensor, "S"]:
     """What each sample adds to its ray, exp(-sum_{j<i} sigma_j delta_j) (1 - exp(-sigma_i delta_i)), for NPC.
 
-    As `volume.rendering.composite_weights`, but an open interval does not cost the other rays their digits.
+    As `volume.rendering.composite_weights`, but accurate with open intervals, where that one loses digits.
 
     >>> open_density_weights(torch.tensor([0.0, 3.0]), torch.tensor([1.0, 1e10]), torch.tensor([0, 0]))
     tensor([0., 1.])
