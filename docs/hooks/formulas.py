@@ -1,4 +1,6 @@
-r"""Formulas of the documentation become MathML while it is built: no script, nothing fetched, and browsers draw them.
+r"""Formulas of the documentation become MathML while it is built.
+
+Browsers render that themselves: no script runs, nothing is fetched, and it works without a network.
 
 Markdown and docstrings write them as `$s = s_1 + s_2$` or between lines of `$$`; the extension `pymdownx.arithmatex`
 marks them, and MkDocs calls `on_page_content` with the finished page.
@@ -18,4 +20,9 @@ def on_page_content(content: str, **_: object) -> str:
 
 
 def _mathml(mark: re.Match[str]) -> str:
-    return convert(html.unescape(mark[3]), display="block" if mark[2] == "[" else "inline")
+    made = convert(
+        html.unescape(mark[3]).replace(r"\arg", r"\mathrm{arg}\,"), display="block" if mark[2] == "[" else "inline"
+    )
+    if "\\" in made:
+        raise ValueError(f"The formula {mark[3]} has a command that cannot be typeset.")
+    return made

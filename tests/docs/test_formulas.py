@@ -29,5 +29,11 @@ def test_signs_of_html_stay_signs(formula: str) -> None:
     assert ElementTree.fromstring(f"<x>{built(f'${formula}$')}</x>") is not None
 
 
+def test_a_command_that_cannot_be_typeset_is_named() -> None:
+    with pytest.raises(ValueError, match="nonsense"):
+        built(r"$\nonsense x$")
+    assert "\\" not in built(r"$\arg\min_v \|x - v\|$")
+
+
 def test_prices_and_commands_are_no_formulas() -> None:
     assert built("It costs $ 5 or $ 6; `$ make demo`.").count("<math") == 0
