@@ -19,7 +19,7 @@ from tiny_person import Run, tiny_recipe
 from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.recipe import Recipe
-from twofold.training.loop import COMPILED, NOTHING_COMPILED, train
+from twofold.training.loop import COMPILED, NOTHING_COMPILED, Progress, train
 from twofold.training.run import read_checkpoint
 
 CPU = torch.device("cpu")
@@ -30,7 +30,8 @@ sys.path.insert(0, sys.argv[4])
 from tiny_person import tiny_recipe
 from dataclasses import replace
 from twofold.capture.folder import read_capture
-from twofold.training.loop import train
+from twofold.errors import TwofoldError
+from twofold.training.loop import Progress, train
 torch.set_num_threads(1)
 folder, steps, every = Path(sys.argv[2]), int(sys.argv[3]), 3
 recipe = tiny_recipe(steps, checkpoint_every=every, images_per_step=2)
@@ -207,7 +208,8 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 from training.test_loop import dense
 from twofold.capture.folder import read_capture
-from twofold.training.loop import train
+from twofold.errors import TwofoldError
+from twofold.training.loop import Progress, train
 for choice in ("never", "always"):
     train(read_capture(sys.argv[1]), dense(4, choice), Path(sys.argv[2]) / choice, torch.device("cpu"))
 """
@@ -226,3 +228,28 @@ def test_compiled_networks_learn_what_plain_ones_do(person: Capture, tmp_path: P
 def test_training_lowers_the_loss(trained: Run) -> None:
     seen = [sum(progress.losses.values()) for progress in trained.told]
     assert sum(seen[-10:]) < 0.7 * sum(seen[:10])
+
+
+def test_a_surface_that_is_not_finite_ends_a_training(person: Capture, tmp_path: Path, monkeypatch) -> None:
+    """Finite parameters may overflow where they are combined."""
+    monkeypatch.setattr("twofold.training.loop._level_on_body", lambda avatar, frame: torch.tensor([0.1, torch.nan]))
+    with pytest.raises(TwofoldError, match="diverged: the surface is not finite at step 2; lower the learning rates"):
+        train(person, recipe_of(2), tmp_path / "run", CPU)
+    assert not (tmp_path / "run" / "checkpoint.safetensors").exists()
+
+
+def test_parameters_that_are_not_finite_end_a_training_before_they_are_drawn(person: Capture, tmp_path: Path) -> None:
+    drawn = []
+
+    def watch(progress: Progress) -> None:
+        if progress.step == 20:
+            with torch.no_grad():
+                next(p for p in avatars[0].parameters() if p.ndim == 2)[0, 0] = torch.nan
+
+    avatars = []
+    with pytest.raises(TwofoldError, match="is not finite at step 20"):
+        train(
+            person, tiny_recipe(40, preview_every=20, checkpoint_every=40), tmp_path / "run", CPU, watch=watch,
+            before_first=avatars.append, preview=lambda avatar, step: drawn.append(step),
+        )  # fmt: skip
+    assert drawn == []

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from tiny_person import tiny_recipe
 
@@ -279,3 +280,67 @@ def test_grids_and_shells_that_fill_any_memory_or_hold_nothing_are_refused_by_na
 def test_shell_does_not_reach_beyond_the_features():
     with pytest.raises(TwofoldError, match=r"sampler\.radius should be at most field\.radius"):
         with_overrides(RECIPE, ["method.sampler.radius=0.5"])
+
+
+@pytest.mark.parametrize("step", ["-5", "seven", "", "1e3", "9" * 5000])
+def test_a_checkpoint_of_no_step_is_damaged(run, step):
+    save_file(load_file(run / "checkpoint.safetensors"), run / "checkpoint.safetensors", {"step": step})
+    with pytest.raises(TwofoldError, match="is damaged: the step it was written after is ") as error:
+        load(run)
+    assert len(sentence(error)) < 500
+
+
+def test_a_checkpoint_that_lost_a_tensor_is_damaged(run):
+    with safe_open(run / "checkpoint.safetensors", "pt") as stored:
+        about = stored.metadata()
+    tensors = load_file(run / "checkpoint.safetensors")
+    for name in [name for name in tensors if name.startswith("optimizer.0.")]:
+        del tensors[name]
+    save_file(tensors, run / "checkpoint.safetensors", about)
+    with pytest.raises(TwofoldError, match="is damaged: it lacks tensors"):
+        read_checkpoint(run)
+
+
+def test_moments_that_are_not_all_there_do_not_continue(begun, subject):
+    tensors, _ = read_checkpoint(begun)
+    optimizer = make_optimizer(RECIPE.method.build(subject, 1), RECIPE.training)
+    for wrong in ("optimizer.0.exp_avg_sq", "optimizer.0.step"):
+        with pytest.raises(TwofoldError, match=f"lacks {wrong}"):
+            load_optimizer(optimizer, {name: t for name, t in tensors.items() if name != wrong})
+    for name in ("optimizer.x.step", "optimizer.0.step.more", "optimizer.0.surprise", "optimizer."):
+        with pytest.raises(TwofoldError, match="first at optimizer"):
+            load_optimizer(optimizer, tensors | {name: torch.zeros(())})
+    with pytest.raises(TwofoldError, match=r"optimizer\.0\.step"):
+        load_optimizer(optimizer, tensors | {"optimizer.0.step": torch.tensor(torch.nan)})
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_an_avatar_with_numbers_that_are_not_finite_is_not_loaded(run, value):
+    with safe_open(run / "checkpoint.safetensors", "pt") as stored:
+        about = stored.metadata()
+    tensors = load_file(run / "checkpoint.safetensors")
+    tensors["avatar.field.low_grid.table"][0, 0] = value
+    save_file(tensors, run / "checkpoint.safetensors", about)
+    with pytest.raises(TwofoldError, match=r"holds field\.low_grid\.table with numbers that are not finite") as error:
+        load(run)
+    sentence(error)
+
+
+def test_moments_that_ran_away_do_not_replace_a_good_checkpoint(run):
+    before = (run / "checkpoint.safetensors").read_bytes()
+    avatar, _ = load(run)
+    optimizer = make_optimizer(avatar, RECIPE.training)
+    load_optimizer(optimizer, read_checkpoint(run)[0])
+    next(iter(optimizer.state.values()))["exp_avg_sq"].fill_(torch.inf)
+    with pytest.raises(TwofoldError, match=r"optimizer\.\d+\.exp_avg_sq is not finite at step 8; lower the learning"):
+        write_checkpoint(run, avatar, optimizer, 8)
+    assert (run / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_a_capture_whose_stored_place_is_no_place_is_asked_for(run):
+    about = json.loads((run / "run.json").read_text())
+    for place in ("x" * 5000, "a\0b", 7, None, ["a"]):
+        (run / "run.json").write_text(json.dumps(about | {"capture": place}))
+        with pytest.raises(TwofoldError, match="--capture") as error:
+            find_capture(run)
+        assert len(sentence(error)) < 900

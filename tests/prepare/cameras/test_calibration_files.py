@@ -171,6 +171,8 @@ def spoilt(folder, kind, old, new):
         ("qualisys", 'focalLengthU="6', 'focalLengthU="-6', "camera cam0: the focal lengths should be above 0"),
         ("qualisys", "</cameras>", "", "is no valid XML"),
         ("qualisys", "<calibration>", '<!DOCTYPE a [<!ENTITY b "c">]><calibration>', "entities of its own"),
+        ("qualisys", 'right="719"', 'right="nan"', "camera cam0: fov_video should give left, top, right, bottom"),
+        ("qualisys", 'bottom="1279"', 'bottom="1e8"', "camera cam0: its pictures have 720x100000001 pixels"),
         ("qualisys", "<camera ", "<kamera ", "is no valid XML"),
         ("qualisys", 'right="719"', 'right="-5"', "its pictures have -4x1280 pixels"),
         ("opencv/extri.yml", "T_cam1", "t_cam1", r"camera cam1: extri.yml should give T_cam1"),
@@ -192,6 +194,12 @@ def test_broken_calibrations_are_refused_in_one_sentence(tmp_path, kind, old, ne
         read_calibration(spoilt(tmp_path, kind, old, new))
     assert str(tmp_path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("encoding", ["unheard-of", "utf-16", "latin-1", "ucs-4", "idna"])
+def test_an_encoding_that_a_file_only_claims_does_no_harm(tmp_path, encoding):
+    path = spoilt(tmp_path, "qualisys", "encoding='ASCII'", f"encoding='{encoding}'")
+    assert list(read_calibration(path)) == ["cam0", "cam1", "cam2"]
 
 
 def test_lengths_in_millimetres_are_noticed(tmp_path):
