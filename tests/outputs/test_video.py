@@ -1,5 +1,6 @@
 """Videos are read back: size, rate, order and colours."""
 
+import os
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from twofold.errors import TwofoldError
-from twofold.outputs.video import write_video
+from twofold.outputs.video import write_alpha_video, write_video
 
 COLORS = np.array([[200, 30, 40], [20, 180, 60], [30, 60, 220], [240, 240, 240], [10, 10, 10]], dtype=np.uint8)
 
@@ -90,3 +91,21 @@ def test_wrong_frames_are_refused(tmp_path: Path) -> None:
 def test_missing_folder_is_one_clear_sentence(tmp_path: Path) -> None:
     with pytest.raises(TwofoldError, match="Cannot write"):
         write_video(tmp_path / "none" / "v.mp4", flat_frames(32, 32), fps=25)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity") or len(os.sched_getaffinity(0)) < 2, reason="one processor")
+@pytest.mark.parametrize("write", [write_video, write_alpha_video])
+def test_the_same_frames_give_the_same_bytes_on_any_number_of_processors(tmp_path: Path, write) -> None:
+    channels = 4 if write is write_alpha_video else 3
+    random = np.random.default_rng(0)
+    frames = [random.integers(0, 256, (128, 160, channels), dtype=np.uint8) // (1 + i % 3) for i in range(24)]
+    ending = "webm" if channels == 4 else "mp4"
+    every = os.sched_getaffinity(0)
+    try:
+        for number, processors in enumerate((every, {min(every)}, every)):
+            os.sched_setaffinity(0, processors)
+            write(tmp_path / f"{number}.{ending}", iter(frames), 12)
+    finally:
+        os.sched_setaffinity(0, every)
+    first, second, third = ((tmp_path / f"{number}.{ending}").read_bytes() for number in range(3))
+    assert first == second == third

@@ -26,7 +26,7 @@ def write_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 3"]], 
     """Writes frames as they come, one at a time, as H.264 (or MPEG-4 where the library has no x264).
 
     Colours are stored with half the resolution (yuv420p: all players know it), so odd sides get one more row or column,
-    a copy of the last.
+    a copy of the last. The same frames give the same bytes.
 
     Args:
         path: ends in .mp4.
@@ -50,6 +50,7 @@ def write_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 3"]], 
                 stream.pix_fmt = "yuv420p"
                 stream.options = {"crf": QUALITY} if x264 else {"qscale": "3"}
                 stream.codec_context.colorspace = matrix
+                stream.codec_context.thread_count = 1  # with more, the bytes depend on how many processors there are
             if picture.shape[:2] != size:
                 raise ValueError(f"a frame of the video is {picture.shape[:2]}, the first was {size}")
             padded = np.pad(picture, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
@@ -63,6 +64,8 @@ def write_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 3"]], 
 
 def write_alpha_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 4"]], fps: float | int) -> None:
     """Writes frames with opacity as they come: VP9 in a WebM, ProRes 4444 in a MOV (Apple's QuickTime).
+
+    The same frames give the same bytes.
 
     Args:
         path: ends in a key of `ALPHA_CODECS`.
@@ -79,7 +82,8 @@ def write_alpha_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 
         raise TwofoldError(
             f"The installed PyAV lacks {codec}, which {ending} with opacity needs; name a folder instead."
         )
-    with write_atomically(path) as temporary, av.open(str(temporary), "w") as file:
+    exact = {"fflags": "+bitexact"}  # else a WebM gets a random number of its own
+    with write_atomically(path) as temporary, av.open(str(temporary), "w", options=exact) as file:
         stream = None
         for image in frames:
             if stream is None:
@@ -87,6 +91,7 @@ def write_alpha_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 
                 stream.height, stream.width = image.shape[0] + image.shape[0] % 2, image.shape[1] + image.shape[1] % 2
                 stream.pix_fmt, stream.options = pixels, options
                 stream.codec_context.colorspace = Colorspace.ITU709
+                stream.codec_context.thread_count = 1
             padded = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
             frame = av.VideoFrame.from_ndarray(padded, format="rgba")
             limited = frame.reformat(format=pixels, dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)
