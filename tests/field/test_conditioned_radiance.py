@@ -33,11 +33,11 @@ def test_noise_is_added_before_the_relu_in_training_only(generator):
     field = ConditionedRadiance(3, 2, generator)
     with torch.no_grad():
         field.density.layers[-1].weight.zero_()
-        field.density.layers[-1].bias.fill_(1.0)
+        field.density.layers[-1].bias.fill_(-0.5)
         arguments = (torch.zeros(2000, 3), torch.zeros(2000, 2), torch.zeros(128))
         quiet, noisy = field(*arguments).density, field(*arguments, generator).density
-    assert (quiet == 1).all()
-    assert 0.1 < (noisy == 0).float().mean() < 0.22  # P(N(1, 1) < 0) = 0.159
+    assert (quiet == 0).all()
+    assert 0.25 < (noisy > 0).float().mean() < 0.37  # P(N(-0.5, 1) > 0) = 0.309
 
 
 def test_parameter_counts_are_the_authors():

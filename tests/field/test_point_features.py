@@ -34,8 +34,11 @@ def literal_nearest(query, coordinates, positions):
     return min(candidates, key=lambda n: math.dist(query.tolist(), positions[n].tolist()))
 
 
-def test_nearest_point_is_that_of_three_reachable_parts(scene):
+def test_nearest_point_is_that_of_three_reachable_parts(scene, generator):
     cloud, posed, _, queries = scene
+    low, high = posed.positions.detach().amin(0), posed.positions.detach().amax(0)
+    anywhere = low + (high - low) * torch.rand(100, 3, generator=generator, dtype=torch.float64)
+    queries = torch.cat([queries, anywhere])
     coordinates = coordinates_of(queries, cloud, posed)
     found = nearest_posed_points(queries, coordinates, posed.positions)
     expected = [literal_nearest(q, c, posed.positions) for q, c in zip(queries, coordinates, strict=True)]

@@ -40,6 +40,12 @@ def test_features_are_those_of_all_boxes(field, generator):
     torch.testing.assert_close(field(pose, x), literal_features(field, pose, x))
 
 
+def test_largest_of_24_boxes_may_be_negative(field, generator):
+    pose = field.pose(torch.randn(24, 6, generator=generator, dtype=torch.float64))[:1].expand(24, -1)
+    x = 0.3 * torch.randn(4, 1, 3, generator=generator, dtype=torch.float64).expand(4, 24, 3)
+    torch.testing.assert_close(field(pose, x), literal_features(field, pose, x))
+
+
 def test_gradients_are_those_of_all_boxes(field, generator):
     features = torch.randn(24, 6, generator=generator, dtype=torch.float64)
     x = torch.randn(5, 24, 3, generator=generator, dtype=torch.float64, requires_grad=True)
