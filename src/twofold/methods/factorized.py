@@ -110,6 +110,7 @@ class FactorizedAvatar(Avatar):
     shell_shape: Tensor
     canonical_points: Tensor
     late_shape: Tensor
+    rest_joints: Tensor
 
     def __init__(self, config: FactorizedConfig, subject: Subject, seed: int) -> None:
         """Builds the field around the subject's canonical body."""
@@ -117,7 +118,9 @@ class FactorizedAvatar(Avatar):
         self.config, self.subject = config, subject
         generator = torch.Generator().manual_seed(seed)
         self.refinement = PoseRefinement(subject.times, len(subject.betas), tuple(config.pose.refine))
-        canonical = pose_body(shape_body(subject.body, subject.betas), subject.poses[0], subject.translations[0])
+        given = shape_body(subject.body, subject.betas)
+        canonical = pose_body(given, subject.poses[0], subject.translations[0])
+        self.register_buffer("rest_joints", given.joints.clone(), persistent=False)
         pose_size = 72 if config.pose.with_root else 69
         if isinstance(config.field, GridFieldConfig):
             self.field = config.field.build(canonical, pose_size, generator)
@@ -195,29 +198,27 @@ class FactorizedAvatar(Avatar):
         step: int | None = None,
     ) -> PosedAvatar:  # fmt: skip
         """See `Avatar.pose`. While training, a moment's shell is reused until the next refresh."""
-        pose, translation = pose.to(self.device), translation.to(self.device)
+        data = pose, translation = pose.to(self.device), translation.to(self.device)
         config = self.config
         training = step is not None
-        given, data = self._shape(None), (pose, translation)
         refining = training and step >= config.pose.refine_from
         if time is not None:
             with torch.set_grad_enabled(torch.is_grad_enabled() and refining):
                 pose, translation = self.refinement(time, pose, translation)
         with torch.set_grad_enabled(torch.is_grad_enabled() and refining and bool(self.refinement.parts)):
             refined = training or time is not None or config.pose.test_shape == "refined"
-            shaped = self._shape(self.refinement.shape) if refined else given
-            rest_joints = given.joints if config.pose.canonical_shape == "given" else None
+            shaped = self._shape(self.refinement.shape if refined else None)
+            rest_joints = self.rest_joints if config.pose.canonical_shape == "given" else None
             body = pose_body(shaped, pose, translation, rest_joints)
-            forward = vertex_transforms(body)
         box = joint_box(body.joints)
         if self.box_given:
-            box = joint_box(pose_body(given, *data).joints, self.subject.scene_scale)
+            box = joint_box(pose_body(self._shape(None), *data).joints, self.subject.scene_scale)
         neighbours = config.neighbours
         if step is not None and config.late_neighbours is not None and self._epoch(step) >= config.late_from:
             neighbours = config.late_neighbours
         seen = condition(config.pose, pose, step, self._epoch(step or 0))
         shell, anchors = self._shell(body, time, training), self._anchors(training)
-        return PosedAvatar(body, forward, seen, shell, box, neighbours, anchors)
+        return PosedAvatar(body, vertex_transforms(body), seen, shell, box, neighbours, anchors)
 
     def _shape(self, change: Tensor | None) -> ShapedBody:
         """The body, its shape corrected by so much or as it was given."""
