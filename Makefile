@@ -11,7 +11,7 @@ export NO_MKDOCS_2_WARNING := true
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all checks pytest docs format benchmarks gpu-bundle clean
+.PHONY: help demo test test-all checks pytest docs format benchmarks gpu-bundle web-tools clean
 
 help: ## This list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -47,6 +47,9 @@ benchmarks: $(VENV)/.ready-studio ## Measure speed, beside the reference form, o
 
 gpu-bundle: $(VENV)/.ready-studio ## What a machine with a GPU and no network needs, in gpu-bundle/ (CAPTURE=folder to choose)
 	$(BIN)/python -m benchmarks.gpu_bundle gpu-bundle $(if $(CAPTURE),--capture $(CAPTURE))
+
+web-tools: ## What the tests in Node and Chromium need (Node and Chromium themselves come from your system)
+	npm ci --no-audit --no-fund --prefix tests/web
 
 clean: ## Remove what the targets made, .venv included
 	rm -rf $(VENV) site dist build .pytest_cache .ruff_cache .import_linter_cache .hypothesis
