@@ -55,7 +55,7 @@ def read_header(path: Path) -> Header:
         TwofoldError: it is missing, no image in one of `FORMATS`, or has more than `MAX_PIXELS`.
     """
     with _opened(path) as image:
-        deep = image.mode.startswith("I") or image.mode == "F" or (bool(image.tile) and ";16" in str(image.tile[0][3]))
+        deep = image.mode.startswith("I") or image.mode == "F" or ";16" in str(getattr(image, "tile", ""))
         upright = image.format == "TIFF" or image.getexif().get(_ORIENTATION, 1) == 1
         return Header(*image.size, image.mode, deep, upright)
 

@@ -11,6 +11,7 @@ import torch
 from filmed import describe, each_mask, move
 from PIL import Image
 
+from twofold.capture.folder import read_capture
 from twofold.capture.validate import validate
 from twofold.check.check_report import numbers, overlay, write_check
 from twofold.check.frame_measures import mirrored_pose, side_of_faces
@@ -110,6 +111,21 @@ def test_sides_exchanged_in_some_moments_are_named(turner):
     found = topics(turner)
     assert found["sides"].level == "warning"
     assert found["sides"].where == "camera front at 6-8; camera side at 8"
+
+
+def test_splits_are_written_without_what_should_be_left_out(turner, capsys):
+    def exchange(arrays):
+        poses = torch.from_numpy(arrays["poses"])
+        return {"poses": torch.stack([mirrored_pose(p) if t in (6, 7, 8) else p for t, p in enumerate(poses)]).numpy()}
+
+    move(turner, exchange)
+    code, said = checked(capsys, turner, "--write-splits")
+    assert code == 0
+    assert "left out of the splits" in said
+    assert "camera front at 6-8" in said
+    shown = {(f.camera_name, f.time) for frames in read_capture(turner).splits.values() for f in frames}
+    assert {("front", 6), ("front", 7), ("front", 8)}.isdisjoint(shown)
+    assert "the splits stay as they are" in checked(capsys, turner, "--write-splits")[1]
 
 
 def test_pictures_of_other_moments_are_named(turner):

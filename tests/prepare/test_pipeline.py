@@ -1,6 +1,7 @@
 """From clips to a capture, with an estimator that knows the truth: what is written and what left out."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 from acting import HEIGHT, WIDTH, joints_of
 from PIL import Image, ImageDraw
-from staged import FPS, PLAIN, Stage, names
+from staged import FPS, PLAIN, SHIRT, Finder, Stage, names
 
 from twofold.capture.folder import read_capture
 from twofold.capture.layout import read_contents
@@ -246,3 +247,59 @@ def test_own_landmarks_take_the_place_of_those_found(tmp_path, monkeypatch):
     used = asked[0][0][0].track
     np.testing.assert_allclose(used.pixels, own, atol=1e-4)
     np.testing.assert_allclose(used.world, track.world, atol=1e-5)
+
+
+def masks_in(folder, masks, first=0):
+    folder.mkdir()
+    for time, mask in enumerate(masks):
+        Image.fromarray(mask).save(folder / f"mask{time + first:03d}.png")
+    return folder
+
+
+def test_masks_that_fit_two_countings_are_compared_with_the_images(tmp_path, monkeypatch):
+    """Files 1 to 12 of 14 images: counted from 0 they begin with the second image."""
+    stage = Stage(tmp_path / "clips", 14)
+    stage.is_understood(monkeypatch)
+    own = masks_in(tmp_path / "masks", stage.evidence["cam0"].masks[1:13], first=1)
+    done = stage.prepare(tmp_path / "me", replace(PLAIN, masks=own))
+    (sentence,) = [warning for warning in done.warnings if "fit the clip in 2 ways" in warning]
+    assert "taken as counted from 0" in sentence
+    mask = read_capture(tmp_path / "me").train[3].mask().numpy()
+    with Image.open(own / "mask003.png") as picture:
+        assert np.array_equal((255 * mask).round(), np.asarray(picture))
+
+
+def test_the_estimator_sees_the_person_of_the_own_masks_alone(tmp_path, monkeypatch):
+    stage = Stage(tmp_path / "clips", 14)
+    stage.is_understood(monkeypatch)
+    own = masks_in(tmp_path / "masks", stage.evidence["cam0"].masks)
+    shown = []
+    see = Finder.__call__
+    monkeypatch.setattr(Finder, "__call__", lambda self, image, t: shown.append(image) or see(self, image, t))
+    counted = []
+    stage.prepare(tmp_path / "me", replace(PLAIN, masks=own), people=counted.append)
+    assert not counted, "who is meant is known"
+    for image, mask in zip(shown, stage.evidence["cam0"].masks, strict=True):
+        assert (image[mask > 0] == SHIRT).all(-1).mean() > 0.99
+        assert (image[:, :4] == 127).all()
+
+
+def test_dropped_frames_are_in_no_split_and_listed_with_the_reason(tmp_path, monkeypatch):
+    stage = Stage(tmp_path / "clips", 14)
+    stage.is_understood(monkeypatch)
+    done = stage.prepare(tmp_path / "me", replace(PLAIN, drop=(2, 7)))
+    assert {2, 7}.isdisjoint(done.kept)
+    assert len(done.kept) == 12
+    assert "2 moments were left out: 2, 7 (asked for with --drop)." in done.warnings
+    assert notes_of(tmp_path / "me")["left_out_because"] == {"2": "asked for with --drop", "7": "asked for with --drop"}
+
+
+def test_images_that_repeat_are_left_out(tmp_path, monkeypatch):
+    """As in a video that was stretched: no image serves two frames."""
+    stage = Stage(tmp_path / "clips", 14)
+    stage.is_understood(monkeypatch)
+    stage.motion = stage.motion[slice(0, 13)]
+    shutil.copy(stage.clips[0] / "012.png", stage.clips[0] / "013.png")
+    done = stage.prepare(tmp_path / "me")
+    assert done.kept == tuple(range(13))
+    assert "cam0: 1 pictures equal the one before them and are left out." in done.warnings

@@ -42,6 +42,9 @@ FAILURES = [
     (cut_off, {}, "of cam0 head, hands or feet are beyond the picture's edge"),
     (damaged, {}, "009.png is"),
     (lambda stage: None, {"train_camera": "side"}, "--train-camera side is none of the clips; they are cam0."),
+    (lambda stage: None, {"drop": (3, 14)}, "--drop names frame 14, and cam0 has 14, counted from 0"),
+    (lambda stage: None, {"person": "masks"}, "give them with --masks, too"),
+    (lambda stage: None, {"person": 0}, "--person counts people from the left, from 1; it is 0"),
     (lambda stage: None, {"held_out": 1}, "One moment of 1 cannot be held out"),
     (lambda stage: stage.clips.append(stage.clips[0]), {}, "2 videos were given, which need --calibration"),
     (lambda stage: stage.clips.clear(), {}, "none was given"),
@@ -198,4 +201,13 @@ def test_a_place_that_cannot_be_written_is_known_before_any_work(tmp_path, monke
     (tmp_path / "file").write_text("x")
     with pytest.raises(TwofoldError, match="Cannot write"):
         stage.prepare(tmp_path / "file" / "me")
+    assert not stage.finders
+
+
+@pytest.mark.parametrize("piece", ["masks", "landmarks", "poses", "train_camera"])
+def test_what_the_user_names_is_checked_before_any_image_is_looked_at(tmp_path, piece):
+    stage = Stage(tmp_path / "clips", 14)
+    value = "side" if piece == "train_camera" else tmp_path / "none.npz"
+    with pytest.raises(TwofoldError, match="is none of the clips" if piece == "train_camera" else "none.npz"):
+        stage.prepare(tmp_path / "me", replace(PLAIN, **{piece: value}))
     assert not stage.finders

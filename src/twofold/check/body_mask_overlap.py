@@ -96,8 +96,9 @@ def _bad_frames(facts: Facts, frames: list[FrameFacts]) -> Iterator[Finding]:
             graded(len(facts.elsewhere) > MOST_BAD * len(frames)),
             "exchanged pictures",
             f"{counted(len(facts.elsewhere), 'picture')} with the pose of another moment: {named}{more}",
-            "Put pictures and poses into the same order.",
+            "Put pictures and poses into the same order, or leave them out: check --write-splits.",
             places_of((camera, time) for camera, time, _ in facts.elsewhere),
+            tuple((camera, time) for camera, time, _ in facts.elsewhere),
         )
     known = {(camera, time) for camera, time, _ in facts.elsewhere}
     rest = [f for f in frames if f.iou < LEAST_IOU and (f.camera, f.time) not in known]
@@ -107,8 +108,9 @@ def _bad_frames(facts: Facts, frames: list[FrameFacts]) -> Iterator[Finding]:
             "bad frames",
             f"In {counted(len(rest), 'picture')} body and mask do not agree: IoU below {LEAST_IOU:g}, down to "
             f"{min(f.iou for f in rest):.2f}",
-            "Fit these again, mend their masks, or take them out of the splits.",
+            "Fit these again, fix their masks, or leave them out: check --write-splits, or prepare --drop FRAMES.",
             places(rest),
+            tuple((f.camera, f.time) for f in rest),
         )
 
 
@@ -120,8 +122,9 @@ def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
             graded(len(swapped) > MOST_BAD * len(telling)),
             "sides",
             f"In {counted(len(swapped), 'picture')} the body fits better with left and right limbs exchanged",
-            "Exchange left and right in these poses, or take them out of the splits.",
+            "Exchange left and right in these poses, or leave them out: check --write-splits.",
             places(swapped),
+            tuple((f.camera, f.time) for f in swapped),
         )
     if len(telling) < 0.25 * len(frames):
         yield Finding(
@@ -143,8 +146,10 @@ def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
             graded(len(turned) > MOST_BAD * len(frames)),
             "facing",
             f"In {counted(len(turned), 'picture')} the body fits better facing the other way",
-            "Turn these roots by half about the body's axis and exchange left and right, or leave them out.",
+            "Turn these roots by half about the body's axis and exchange left and right, or leave them out: check "
+            "--write-splits.",
             places(turned),
+            tuple((f.camera, f.time) for f in turned),
         )
 
 

@@ -32,6 +32,8 @@ CELL = (270, 360)
 """Width and height of an overlay, pixels."""
 TINTS = np.array([(72, 190, 130), (245, 140, 30), (40, 120, 250)], np.float32)
 """Trunk and head, left limbs, right limbs; told apart by colour-blind eyes, too."""
+IGNORED = np.array((190, 50, 210), np.float32)
+"""Pixels that are ignored."""
 OUTLINE = (255, 255, 70)
 """Of the mask."""
 GOOD_IOU = 0.8
@@ -79,6 +81,8 @@ def overlay(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """The posed body tinted over the image, left limbs orange and right ones blue, and the mask's outline.
 
+    What is ignored, because an object hides the person there, is purple.
+
     Args:
         frame: holds the image.
         shaped: the person's body.
@@ -91,8 +95,7 @@ def overlay(
     flat = picture.reshape(-1, 3)
     pixel = look.hits.pixel.numpy()
     flat[pixel] = 0.5 * flat[pixel] + 0.5 * TINTS[sides[look.hits.face.numpy()]]
-    shaded = 0.6 * picture
-    picture = np.where(look.known[..., None], picture, shaded)
+    picture = np.where(look.known[..., None], picture, 0.4 * picture + 0.6 * IGNORED)
     edge = look.mask & ~np.asarray(ndimage.binary_erosion(look.mask, border_value=1), dtype=bool)
     picture[edge] = OUTLINE
     stored = Image.fromarray(picture.round().astype(np.uint8))
@@ -173,7 +176,8 @@ def _sheets(facts: Facts, capture: Capture) -> list[dict[str, Any]]:
     shaped = shape_body(capture.body, capture.betas)
     sides = side_of_faces(shaped)
     worst = sorted(facts.frames, key=lambda f: f.iou)[:WORST]
-    even = spread([f for f in facts.frames if f not in worst], EVEN)
+    hidden = sorted((f for f in facts.frames if f.ignored > 0 and f not in worst), key=lambda f: -f.ignored)[:WORST]
+    even = spread([f for f in facts.frames if f not in worst and f not in hidden], EVEN)
 
     def shown(f: FrameFacts) -> dict[str, Any]:
         pixels = overlay(frames[f.camera, f.time], shaped, sides)
@@ -182,6 +186,7 @@ def _sheets(facts: Facts, capture: Capture) -> list[dict[str, Any]]:
     with torch.inference_mode():
         return [
             {"heading": "Lowest IoU", "overlays": [shown(f) for f in worst]},
+            {"heading": "Most ignored, as hidden by held objects", "overlays": [shown(f) for f in hidden]},
             {"heading": "Others, evenly spread", "overlays": [shown(f) for f in even]},
         ]
 

@@ -21,6 +21,7 @@ class Finding:
         what: a sentence.
         where: cameras and moments; empty for the whole capture.
         mend: a sentence about what to do.
+        images: camera and time of those that `check --write-splits` leaves out because of it.
     """
 
     level: Level
@@ -28,6 +29,7 @@ class Finding:
     what: str
     mend: str
     where: str = ""
+    images: tuple[tuple[str, int], ...] = ()
 
     def __str__(self) -> str:
         where = f" ({self.where})" if self.where else ""
@@ -45,6 +47,15 @@ class Judgement:
         """Of the whole capture."""
         levels = {finding.level for finding in self.findings}
         return "not trainable" if "fault" in levels else "usable" if "warning" in levels else "good"
+
+    @property
+    def unfit(self) -> dict[tuple[str, int], str]:
+        """Camera and time of the images to leave out of the splits, and the topic of the first finding that says so."""
+        found: dict[tuple[str, int], str] = {}
+        for finding in self.findings:
+            for image in finding.images:
+                found.setdefault(image, finding.topic)
+        return found
 
     @property
     def words(self) -> str:

@@ -85,6 +85,7 @@ class FrameFacts:
         body_height: of the person standing upright at that distance, pixels.
         body_outside: share of the body's points that project outside the picture.
         mask: facts of the mask alone.
+        ignored: share of the mask that is ignored, because something hides the person there.
         twins: whether other sides fit better.
         sharpness: mean strength of the finest details on the person, 0..1.
     """
@@ -98,6 +99,7 @@ class FrameFacts:
     body_height: float
     body_outside: float
     mask: MaskFacts
+    ignored: float
     twins: Twins
     sharpness: float
 
@@ -292,6 +294,7 @@ def frame_facts(frame: Frame, split: str, shaped: ShapedBody, points: ShapedBody
         body_height=tall,
         body_outside=1 - float(inside.float().mean()),
         mask=mask_facts(mask),
+        ignored=1 - np.count_nonzero(shown) / max(np.count_nonzero(look.mask), 1),
         twins=_twins(frame, points, cloud, mask),
         sharpness=_sharpness(image, mask),
     )

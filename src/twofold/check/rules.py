@@ -63,10 +63,13 @@ def judge(facts: Facts) -> Judgement:
 
 def _merged(findings: list[Finding]) -> list[Finding]:
     """Findings of which those that differ in their place alone are one."""
-    groups: dict[tuple[Level, str, str, str], list[str]] = defaultdict(list)
+    groups: dict[tuple[Level, str, str, str], list[Finding]] = defaultdict(list)
     for f in findings:
-        groups[f.level, f.topic, f.what, f.mend].append(f.where)
-    return [Finding(*key, "; ".join(where for where in places if where)) for key, places in groups.items()]
+        groups[f.level, f.topic, f.what, f.mend].append(f)
+    return [
+        Finding(*key, "; ".join(f.where for f in group if f.where), tuple(image for f in group for image in f.images))
+        for key, group in groups.items()
+    ]
 
 
 def _scale(facts: Facts) -> Iterator[Finding]:
@@ -168,6 +171,18 @@ def _masks(facts: Facts) -> Iterator[Finding]:
             "Keep the person's piece; where something in front parts it, mark that as ignored.",
             places(loose),
         )
+    hidden = [f for f in frames if f.ignored > 0]
+    if hidden:
+        worst = max(hidden, key=lambda f: f.ignored)
+        yield Finding(
+            "note",
+            "held objects",
+            f"In {counted(len(hidden), 'picture')} a part of the person is ignored, as if an object hid it: at most "
+            f"{worst.ignored:.1%}, on average {sum(f.ignored for f in frames) / len(frames):.1%} of the mask",
+            "Compare the overlays: ignored parts are purple. If they show the person's own body, prepare again with "
+            "--held-objects keep.",
+            places(hidden),
+        )
     cropped = [f for f in frames if f.mask.borders]
     if len(cropped) > CROPPED * len(frames):
         sides = sorted({side for f in cropped for side in f.mask.borders})
@@ -242,8 +257,9 @@ def _motion(facts: Facts) -> Iterator[Finding]:
             "jumps",
             f"{counted(len(trained), 'moment')} cannot be reached in time from the one before: failed or exchanged "
             "frames, or a wrong `fps`",
-            "Fit these again or take them out of the splits.",
+            "Fit these again, or leave them out: check --write-splits, or prepare --drop FRAMES.",
             f"times {spans(trained)}",
+            tuple((camera.name, time) for camera in facts.cameras for time in trained),
         )
     if rest:
         yield Finding(

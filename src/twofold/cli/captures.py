@@ -134,6 +134,7 @@ def check(
     capture: Annotated[Path, tyro.conf.Positional],
     out: Path | None = None,
     max_images: int = 100,
+    write_splits: bool = False,
 ) -> None:
     """Check whether a capture is worth training on, and report what to fix; exit code 1 where it is not trainable.
 
@@ -141,8 +142,11 @@ def check(
         capture: Capture folder.
         out: Folder for the report and its numbers; by default CAPTURE/check.
         max_images: Images looked at, evenly spread.
+        write_splits: Whether images that findings advise to leave out are taken out of the capture's splits.
     """
+    from twofold.capture.splits import leave_out
     from twofold.check.check_report import require_no_file, write_check
+    from twofold.check.findings import places_of
     from twofold.check.measure import measure_capture
     from twofold.check.rules import judge
 
@@ -157,6 +161,16 @@ def check(
     for finding in judgement.findings:
         console().print(f"{finding.level}: {finding}", soft_wrap=True)
     console().print(judgement.words, soft_wrap=True)
+    if write_splits and judgement.unfit:
+        left = leave_out(capture, judgement.unfit)
+        say(
+            f"{len(left)} of the images looked at are left out of the splits of {capture / 'capture.json'}: "
+            f"{places_of(left)}.",
+            f"twofold check {capture}",
+        )
+        return
+    if write_splits:
+        console().print("No image has to be left out; the splits stay as they are.", soft_wrap=True)
     untrainable = judgement.level == "not trainable"
     say(f"The report is {page}.", "fix what it names and check again" if untrainable else f"twofold train {capture}")
     if untrainable:

@@ -119,17 +119,18 @@ def describe_video(path: Path) -> VideoInfo:
 
 def _rate(stated: Fraction | None, measured: float | None, path: Path, remarks: list[str]) -> float:
     """Pictures per second: what the file states where its time stamps agree, else what these show."""
-    possible = stated is not None and 0.1 <= stated <= 1000
+    given = 0.0 if stated is None else float(stated)
+    possible = 0.1 <= given <= 1000
     if measured is None or not 0.1 <= measured <= 1000:
         if possible:
-            return float(stated)
+            return given
         remarks.append(f"{path.name} does not say its frame rate; {_USUAL_RATE} a second is taken.")
         return float(_USUAL_RATE)
-    if possible and abs(measured / float(stated) - 1) <= _SAME_RATE:
-        return float(stated)
+    if possible and abs(measured / given - 1) <= _SAME_RATE:
+        return given
     if possible:
         remarks.append(
-            f"{path.name} states {float(stated):.4g} frames a second and its time stamps show {measured:.4g} on "
+            f"{path.name} states {given:.4g} frames a second and its time stamps show {measured:.4g} on "
             "average, which is taken; such videos have a variable frame rate."
         )
     return measured
