@@ -7,7 +7,7 @@ matplotlib, Pillow). The wheels of smaller ones go into the bundle, in the versi
 
 There, in a copy of this repository:
 
-    python -m pip install --no-index --no-deps gpu-bundle/wheels/*.whl
+    python -m pip install --no-index --no-deps --find-links gpu-bundle/wheels -r gpu-bundle/requirements.txt
     PYTHONPATH=src python -m benchmarks.gpu --minutes 8
 """
 
@@ -26,7 +26,7 @@ LIMIT = 50_000_000
 WHEELS = (
     "tyro", "docstring-parser", "typeguard", "typing-extensions", "rich", "markdown-it-py", "mdurl", "pygments",
     "jaxtyping", "wadler-lindig", "safetensors", "jinja2", "markupsafe", "beartype", "pytest", "pluggy", "iniconfig",
-    "hypothesis", "sortedcontainers", "tensorboard", "scikit-image", "lazy-loader", "tifffile", "imageio", "av",
+    "hypothesis", "sortedcontainers", "tensorboard", "protobuf", "absl-py", "packaging", "scikit-image", "lazy-loader", "tifffile", "imageio", "av",
 )  # fmt: skip
 """From the most needed to what can be done without: a wheel that would break the limit is left out."""
 PLATFORMS = tuple(f"manylinux{version}_x86_64" for version in ("_2_28", "_2_27", "_2_17", "2014", "2010", "1"))
@@ -77,10 +77,11 @@ def bundle(out: Path, capture: Path | None, root: Path) -> int:
         from twofold.studio.generate import StudioConfig, make_studio
 
         make_studio(StudioConfig(size=256, frames=50, cameras=4), out / "capture")
+        shutil.rmtree(out / "capture" / "meshes")  # surfaces are not what is measured, and take 80 MB
     else:
         if not (capture / "capture.json").is_file():
             raise SystemExit(f"{capture} is no capture folder; make one with `twofold prepare` or `twofold import`.")
-        shutil.copytree(capture, out / "capture", ignore=shutil.ignore_patterns("check"))
+        shutil.copytree(capture, out / "capture", ignore=shutil.ignore_patterns("check", "meshes"))
     versions = pinned((root / "constraints.txt").read_text(encoding="utf-8"))
     room = LIMIT - size_of(out) - 10_000
     if room < 0:
@@ -94,7 +95,7 @@ def bundle(out: Path, capture: Path | None, root: Path) -> int:
                 continue
             room -= wheel.stat().st_size
             shutil.copyfile(wheel, out / "wheels" / wheel.name)
-            chosen.append(f"{name}=={versions[name]}")
+            chosen.append(name)  # without a version: what the machine has already stays
     (out / "requirements.txt").write_text("\n".join(chosen) + "\n", encoding="utf-8")
     return size_of(out)
 
@@ -107,7 +108,9 @@ def main(words: list[str] | None = None) -> None:
     given = parser.parse_args(words)
     size = bundle(given.out, given.capture, Path(__file__).resolve().parents[1])
     print(f"{given.out} has {size / 1e6:.1f} MB. Take it along with this repository; there:")
-    print(f"  python -m pip install --no-index --no-deps {given.out}/wheels/*.whl")
+    print(
+        f"  python -m pip install --no-index --no-deps --find-links {given.out}/wheels -r {given.out}/requirements.txt"
+    )
     print("  PYTHONPATH=src python -m benchmarks.gpu --minutes 8")
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from twofold.cli.console import bar, say
+from twofold.cli.main import main
 from twofold.cli.streams import streams_that_never_fail
 
 posix_only = pytest.mark.skipif(os.name == "nt", reason="shells and devices of POSIX")
@@ -15,6 +17,8 @@ posix_only = pytest.mark.skipif(os.name == "nt", reason="shells and devices of P
 SCRIPT = """
 import sys
 from pathlib import Path
+from twofold.cli.console import bar, say
+from twofold.cli.main import main
 from twofold.cli.streams import streams_that_never_fail
 with streams_that_never_fail():
     file = Path(sys.argv[1]).open("w")
@@ -54,3 +58,27 @@ def test_afterwards_the_streams_are_as_before() -> None:
     with streams_that_never_fail():
         assert sys.stdout is not before[0]
     assert (sys.stdout, sys.stderr) == before
+
+
+class Broken(io.StringIO):
+    """A stream whose reader has gone."""
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+    def flush(self) -> None:
+        raise BrokenPipeError
+
+
+def test_progress_and_messages_go_nowhere_when_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("sys.stdout", "sys.stderr"):
+        monkeypatch.setattr(name, Broken())
+    main(["--version"])
+    main(["train", "--settings"])
+    with pytest.raises(SystemExit) as ended:
+        main(["train", "nowhere"])
+    assert ended.value.code == 2
+    with streams_that_never_fail(), bar("Working") as show:
+        for done in (0.0, 0.5, 1.0):
+            show(done, "")
+        say("The result is here.", "nothing")

@@ -53,8 +53,8 @@ def query_nearest(
     distance, index = np.empty((len(points), k)), np.empty((len(points), k), np.int64)
 
     def search(begin: int, end: int) -> None:
-        found = tree.query(points[begin:end], k=[*range(1, k + 1)])
-        distance[begin:end], index[begin:end] = found
+        found = tree.query(points[begin:end], k=k)  # one column comes without its axis
+        distance[begin:end], index[begin:end] = (np.reshape(part, (-1, k)) for part in found)
 
     in_parts(len(points), search)
     return distance, index

@@ -17,7 +17,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     A function that another one wraps, as checks of shapes do in the tests, is compiled as it was written.
     """
-    kernel = numba.njit(nogil=True)(inspect.unwrap(function))
+    kernel: Any = numba.njit(nogil=True)(inspect.unwrap(function))
     # Without any folder to keep results in, numba raises; compiling anew in each process takes some seconds.
     with contextlib.suppress(RuntimeError, OSError):
         kernel._cache = _Cache(kernel.py_func)
