@@ -157,7 +157,7 @@ def test_a_damaged_run_is_said_to_be_one(name: str, damage: Callable[..., bytes]
         if (run / name).read_bytes() != (trained.folder / name).read_bytes() and name == "run.json":
             raise TwofoldError("Most of it is never read.")
 
-    survives(run / name, damage, once)
+    survives(run / name, damage, once, 150)
 
 
 @pytest.mark.parametrize("damage", [damaged_arrays, damaged_bytes])

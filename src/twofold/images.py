@@ -56,7 +56,7 @@ def read_header(path: Path) -> Header:
     """
     with _opened(path) as image:
         deep = image.mode.startswith("I") or image.mode == "F" or ";16" in str(getattr(image, "tile", ""))
-        upright = image.format == "TIFF" or image.getexif().get(_ORIENTATION, 1) == 1
+        upright = _orientation(image) == 1
         return Header(*image.size, image.mode, deep, upright)
 
 
@@ -67,9 +67,8 @@ def upright_size(path: Path) -> tuple[int, int]:
         TwofoldError: see `read_header`; or what it says of its orientation is damaged.
     """
     with _opened(path) as image:
-        # Pillow brings TIFF upright by itself.
-        aside = image.format != "TIFF" and image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
-        return image.size[::-1] if aside else image.size
+        width, height = image.size
+        return (height, width) if _orientation(image) in (5, 6, 7, 8) else (width, height)
 
 
 def load_image(path: Path) -> Image.Image:
@@ -115,6 +114,16 @@ def read_grey(path: Path) -> UInt8[np.ndarray, "h w"]:
 def _converted(path: Path, mode: Literal["RGB", "L"]) -> Image.Image:
     with _opened(path) as image:
         return image.convert(mode)
+
+
+def _orientation(image: Image.Image) -> int:
+    """How an image is brought upright: EXIF's number, 1 where there is nothing to do."""
+    # Pillow brings TIFF upright by itself, and looks for a PNG's EXIF behind its pixels, which takes decoding them.
+    if image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info):
+        return 1
+    with _WARNINGS, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return image.getexif().get(_ORIENTATION, 1)
 
 
 @contextmanager

@@ -27,6 +27,7 @@ _MAX_OPCODES, _MAX_ORIGINS = 1_000_000, 100
 """Of a pickle; the distributed ones have some thousand and some twenty."""
 _MAX_CELLS = 10_000_000
 """Of a sparse matrix: 24 joints by 400,000 vertices."""
+_KINDS = {kind.code.encode("latin1"): kind for kind in pickletools.opcodes}
 _COUNTED = {
     pickletools.TAKEN_FROM_ARGUMENT1: 1, pickletools.TAKEN_FROM_ARGUMENT4: 4, pickletools.TAKEN_FROM_ARGUMENT4U: 4,
     pickletools.TAKEN_FROM_ARGUMENT8U: 8,
@@ -215,7 +216,7 @@ def _opcodes(raw: bytes) -> Iterator[tuple[str, bytes]]:
     """
     place = 0
     while True:
-        opcode = pickletools.code2op.get(raw[place : place + 1].decode("latin1"))
+        opcode = _KINDS.get(raw[place : place + 1])
         if opcode is None:
             raise EOFError if place >= len(raw) else ValueError("an unknown opcode")
         place += 1

@@ -6,6 +6,7 @@ from typing import Any, cast
 
 from twofold.config import KIND, from_dict, to_dict
 from twofold.errors import TwofoldError
+from twofold.inputs import shown
 from twofold.methods import factorized_recipes
 from twofold.methods.base import MethodConfig
 from twofold.methods.factorized import FactorizedConfig
@@ -66,8 +67,11 @@ def recipe_from_dict(data: object, where: str) -> Recipe:
     settings = dict(cast(dict[str, Any], method))
     classes = {m.config.__name__: m.config for m in METHODS.values()}
     kind = settings.pop(KIND, next(iter(classes)))
-    if kind not in classes:
-        raise TwofoldError(f"method in {where} has the unknown kind {kind!r}; known are {', '.join(classes)}.")
+    if not isinstance(kind, str) or kind not in classes:
+        raise TwofoldError(f"method in {where} has the unknown kind {shown(kind)}; known are {', '.join(classes)}.")
     rest = from_dict(_Rest, {name: value for name, value in whole.items() if name != "method"}, where)
-    chosen = from_dict(classes[str(kind)], settings, f"method in {where}")
-    return Recipe(rest.name, chosen, rest.training, rest.seed)
+    chosen = from_dict(classes[kind], settings, f"method in {where}")
+    try:
+        return Recipe(rest.name, chosen, rest.training, rest.seed)
+    except ValueError as error:
+        raise TwofoldError(f"{where} is not possible: {error}.") from error
