@@ -20,9 +20,10 @@ from benchmarks.step import at_work, reference
 from twofold.capture.types import Capture
 from twofold.field.grids import body_distance
 from twofold.kernels.runtime import tune_process
-from twofold.methods.base import Avatar, Subject
+from twofold.methods.base import Avatar
 from twofold.methods.factorized import FactorizedAvatar
 from twofold.methods.factorized_recipes import fast, quick
+from twofold.methods.subject import Subject
 from twofold.outputs.views import draw
 from twofold.training.loop import train
 
@@ -54,7 +55,7 @@ def take_shape(avatar: FactorizedAvatar, capture: Capture, steps: int = 300, poi
     wanted = torch.from_numpy(body_distance(x.numpy(), vertices.numpy(), capture.body.faces.numpy())).to(device)
     x = x.to(device)
     frame = capture.train[0]
-    condition = avatar.pose(frame.pose, frame.translation).condition
+    condition = avatar.pose(frame.pose, frame.translation).own.condition
     optimizer = torch.optim.Adam(avatar.field.parameters(), 5e-4)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     average = 1.0

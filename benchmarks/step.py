@@ -18,9 +18,10 @@ import torch
 
 from benchmarks.common import peak_memory_gb, store, studio_capture, timed
 from twofold.kernels.runtime import tune_process
-from twofold.methods.base import Avatar, Subject
+from twofold.methods.base import Avatar, Mode
 from twofold.methods.factorized import FactorizedConfig
 from twofold.methods.factorized_recipes import fast, quick, released
+from twofold.methods.subject import Subject
 from twofold.recipe import Recipe
 from twofold.training.loop import make_optimizer
 from twofold.training.pixels import PixelSource
@@ -43,24 +44,25 @@ def measure(recipe: Recipe, repeats: int, device: torch.device) -> dict[str, obj
     subject = Subject.of(capture)
     avatar: Avatar = at_work(recipe.method).build(subject, 0).to(device)
     pixels = released().training.pixels
-    source = PixelSource(capture.train, subject.body, subject.betas, pixels, capture.background)
+    source = PixelSource(capture.train, subject.body, subject.betas, pixels)
     optimizer = make_optimizer(avatar, recipe.training)
     background = torch.tensor(capture.background, device=device)
     split = {"pose": 0.0, "render": 0.0, "losses": 0.0, "backward": 0.0, "optimizer": 0.0}
     rays = samples = 0
     count = 0
+    mode = Mode(1)
 
     def step() -> None:
         nonlocal rays, samples, count
         generator = torch.Generator().manual_seed(1)
         frame = capture.train[0]
-        batch = source.draw(0, generator, device)
+        batch = source.draw(0, generator, device).against(background)
         marks = [time.perf_counter()]
-        posed = avatar.pose(frame.pose, frame.translation, frame.time, 1)
+        posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
         marks.append(time.perf_counter())
-        rendering = avatar.render(batch.rays, posed, background, generator)
+        rendering = avatar.render(batch.rays, posed, background, mode, generator)
         marks.append(time.perf_counter())
-        loss = torch.stack(list(avatar.losses(rendering, batch, posed, 1, generator).values())).sum()
+        loss = torch.stack(list(avatar.losses(rendering, batch, posed, mode, generator).values())).sum()
         marks.append(time.perf_counter())
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -70,7 +72,7 @@ def measure(recipe: Recipe, repeats: int, device: torch.device) -> dict[str, obj
         for name, begin, end in zip(split, marks[:-1], marks[1:], strict=True):
             split[name] += end - begin
         rays, count = len(batch.rays), count + 1
-        samples = len(avatar._place(batch.rays, posed, generator).samples) if count == 1 else samples
+        samples = len(avatar.place(batch.rays, posed, mode, generator).samples) if count == 1 else samples
 
     result = timed(step, repeats, warm=1 if repeats > 1 else 0)
     return {

@@ -1,30 +1,21 @@
 """Evaluation: which frames are measured, how, and the file that says so."""
 
-import functools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from twofold.capture.types import Capture, Frame, spread
 from twofold.capture.validate import read_mesh
-from twofold.deform.pose_refinement import PoseRefinement
 from twofold.files import write_json
 from twofold.methods.base import Avatar, PosedAvatar
 from twofold.metrics import image as image_metrics
 from twofold.metrics import shape as shape_metrics
-from twofold.outputs.mesh import extract_surface, pose_surface
+from twofold.outputs.mesh import posed_surface
 from twofold.outputs.shares import Shares
 from twofold.outputs.views import Picture, draw
-
-
-def truth(frame: Frame, background: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
-    """A frame's picture on the capture's background, and its mask."""
-    mask = frame.mask()
-    return frame.image() * mask[..., None] + torch.tensor(background) * (1 - mask[..., None]), mask
-
 
 NEAR = 0.5
 """Seconds over which the errors of an estimator's poses last."""
@@ -47,30 +38,16 @@ _REFINED = (
 
 
 def _refines(avatar: Avatar) -> bool:
-    refinement = getattr(avatar, "refinement", None)
-    return isinstance(refinement, PoseRefinement) and bool(refinement.parts)
+    return bool(avatar.pose_corrections())
 
 
-def pose_at(avatar: Avatar, capture: Capture, frame: Frame) -> PosedAvatar:
+def pose_at(avatar: Avatar, capture: Capture, frame: Frame) -> PosedAvatar[Any]:
     """The avatar in a frame's pose, with what training learned about the errors of the capture's poses.
 
-    A moment that was trained on has a correction of its own. Another one between two of these takes theirs, mixed, if
-    they are no more than `NEAR` seconds apart. All others stay as the capture has them.
+    A training frame has a correction of its own. Another frame between two of these takes theirs, interpolated, if they
+    are no more than `NEAR` seconds apart. All others stay as the capture has them.
     """
-    refinement = getattr(avatar, "refinement", None)
-    if not isinstance(refinement, PoseRefinement) or not refinement.parts or frame.time in refinement.rows:
-        return avatar.pose(frame.pose, frame.translation, frame.time)
-    known = {f.time: f for f in capture.train}
-    before = max((t for t in known if t < frame.time), default=None)
-    after = min((t for t in known if t > frame.time), default=None)
-    if before is None or after is None or (after - before) / capture.fps > NEAR:
-        return avatar.pose(frame.pose, frame.translation, None)
-    neighbours = tuple((t, known[t].pose, known[t].translation) for t in (before, after))
-    on = refinement.root.device
-    with torch.no_grad():
-        neighbours = tuple((t, pose.to(on), place.to(on)) for t, pose, place in neighbours)
-        pose, translation = refinement.between(neighbours, frame.time, frame.pose.to(on), frame.translation.to(on))
-    return avatar.pose(pose, translation, None)
+    return avatar.pose(*avatar.refined_pose(frame.time, frame.pose, frame.translation, NEAR * capture.fps))
 
 
 def sampled(count: int, of: int, what: str) -> str:
@@ -100,7 +77,7 @@ def measure_split(
     frames = spread(capture.splits.get(split, ()), most)
     for frame in frames:
         picture = draw_frame(avatar, capture, frame, refined)
-        image, mask = truth(frame, capture.background)
+        image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         ignored = frame.ignored()
         rows.append(image_metrics.compare(picture.color, image, picture.opacity, mask, ignored))
         shares.append(ignored[image_metrics.subject_box(mask)].float().mean().item())
@@ -124,10 +101,6 @@ def measure_split(
     return means | {"protocol": protocol}
 
 
-def _level(avatar: Avatar, posed: PosedAvatar, x: Tensor) -> Tensor:
-    return avatar.level(x.to(posed.forward.device), posed)
-
-
 def _with_mesh(capture: Capture, most: int | None) -> dict[int, Frame]:
     moments = {f.time: f for split in ("novel_view", "novel_pose", "train") for f in capture.splits.get(split, ())}
     return {time: moments[time] for time in spread([t for t in sorted(capture.meshes) if t in moments], most)}
@@ -141,8 +114,7 @@ def measure_geometry(
     rows = []
     for time, frame in _with_mesh(capture, most).items():
         posed = avatar.pose(frame.pose, frame.translation, None)
-        surface, faces = extract_surface(functools.partial(_level, avatar, posed), posed.body.canonical_vertices, voxel)
-        vertices = pose_surface(surface, posed.body)
+        vertices, faces = posed_surface(avatar, posed, voxel)
         rows.append(shape_metrics.compare_surfaces(vertices.cpu(), faces.cpu(), *read_mesh(capture.meshes[time])))
         if watch:
             watch()
@@ -167,15 +139,13 @@ def measure_refinement(
     Held-out moments are of the split "novel_pose"; without a training moment near them their poses stay as they are.
     `trained` are the training pictures' figures in the poses after, where the caller has them already.
     """
-    refinement = avatar.refinement
-    assert isinstance(refinement, PoseRefinement)
-    found: dict[str, object] = dict(refinement.change())
+    found: dict[str, object] = dict(avatar.pose_corrections())
     told = {"shape": "length of the change of the coefficients"}
     for name, unit in (("root", "radians"), ("body", "radians"), ("translation", "metres")):
         told[name] = f"root mean square change over the training moments, {unit}"
     poses = {"before": "the poses of the capture", "after": "the poses that training made of them"}
     for split, called, known in (("train", "train", trained), ("novel_pose", "held_out", None)):
-        for when in poses if refinement.parts else ():
+        for when in poses:
             after = when == "after"
             figures = known if known and after else measure_split(avatar, capture, split, most, after, watch)
             for figure in ("psnr_box", "silhouette_iou") if figures else ():
@@ -227,7 +197,7 @@ def evaluate(
     geometry = measure_geometry(avatar, capture, meshes, watch=lambda: watch("geometry"))
     if geometry:
         metrics["geometry"] = geometry
-    if isinstance(getattr(avatar, "refinement", None), PoseRefinement):
+    if _refines(avatar):
         metrics["pose_refinement"] = measure_refinement(
             avatar, capture, few, trained, lambda f, p: watch("pose refinement")
         )

@@ -51,6 +51,9 @@ class LossConfig:
     mask_form: Literal["sides", "mean", "hard"] = "sides"
     """"sides": inside and outside rays averaged apart, a pixel on the edge by its parts; "mean": plain mean; "hard": as
     released, with hard labels and averages of their own for patches."""
+    base_mask: float = 0.0
+    """Mask term of the base rendering (ours): without it the base has holes where clothes are as dark as the
+    background, since the common loss compares colours only."""
     s3im: float = 0.1
     s3im_center: float = S3IM_CENTER
     """Middle of the Gaussian window, pixels from its first one of four; 2 in the release."""
@@ -65,14 +68,14 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         """Refuses weights that reward what they should punish."""
-        weights = (self.eikonal, self.common, self.lpips, self.mask, self.s3im)
+        weights = (self.eikonal, self.common, self.lpips, self.mask, self.base_mask, self.s3im)
         right = min(weights) >= 0 < self.reconstruction
         if not right:
             raise ValueError("weights should not be negative, reconstruction positive")
         require_within(
             self, reconstruction=(0, 1e6), eikonal=(0, 1e6), common=(0, 1e6), lpips=(0, 1e6), mask=(0, 1e6),
-            s3im=(0, 1e6), lpips_start=(0, MOST_STEPS), eikonal_points=(1, 1_000_000), eikonal_spread=(0, 1),
-            s3im_center=(0, S3IM_WINDOW - 1), lpips_dropout=(0, 0.99),
+            base_mask=(0, 1e6), s3im=(0, 1e6), lpips_start=(0, MOST_STEPS), eikonal_points=(1, 1_000_000),
+            eikonal_spread=(0, 1), s3im_center=(0, S3IM_WINDOW - 1), lpips_dropout=(0, 0.99),
         )  # fmt: skip
 
 

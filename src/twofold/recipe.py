@@ -30,8 +30,6 @@ class PixelConfig:
     released, those that it covers at all, in that box without its last row and column."""
     replacement: bool = True
     """Whether the same single pixel may be drawn twice; the release draws without replacement."""
-    rounded: bool = True
-    """Whether colours on the background are rounded to 8 bits, a quarter of the memory; not in the release."""
 
     def __post_init__(self) -> None:
         """Refuses choices with which no picture gives pixels, or more than any machine takes."""
@@ -49,11 +47,6 @@ class TrainingConfig:
     images_per_step: int = 2
     """Pictures whose gradients are averaged; each of N processes takes an N-th of them."""
     pixels: PixelConfig = PixelConfig()
-    rate_low: float = 5e-4
-    rate_high: float = 2e-4
-    rate_grid: float = 1e-2
-    rate_beta: float = 1e-4
-    rate_pose: float = 5e-5
     milestones: tuple[int, ...] = (200, 400)
     """Epochs after which the rates are halved; an epoch sees every training picture once."""
     epochs: Literal["images", "steps"] = "images"
@@ -78,11 +71,10 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         """Refuses numbers with which nothing can be trained."""
         most = 100_000_000
-        rates = {name: (0, 1000) for name in vars(self) if name.startswith("rate_")}
         require_within(
             self, steps=(1, most), images_per_step=(1, 1000), checkpoint_every=(1, most), preview_every=(0, most),
             warmup=(0, most), milestones=(0, most), decay=(1e-9, 1), decay_from=(0, 1), clip=(0, 1e6),
-            adam_epsilon=(0, 1), **rates,
+            adam_epsilon=(0, 1),
         )  # fmt: skip
         if not all(0 <= beta < 1 for beta in self.adam_betas):
             raise ValueError(f"adam_betas={self.adam_betas} should lie in 0..1, below 1")

@@ -16,8 +16,8 @@ from twofold.field.factorized_grid import GridFieldConfig
 from twofold.geometry.cameras import Camera
 from twofold.geometry.raster import box_filter, rasterize, supersampled
 from twofold.methods.factorized_recipes import quick
-from twofold.methods.placing import ShellSampler
 from twofold.recipe import Recipe
+from twofold.sampling.shell_sampler import ShellSampler
 from twofold.training.loop import Progress, train
 
 SIZE, MOMENTS, FACTOR = 48, 7, 4
@@ -125,7 +125,7 @@ def tiny_recipe(steps: int = 100, **training: object) -> Recipe:
     method = replace(
         start.method,
         field=GridFieldConfig(low_voxels=(0.12, 0.06), high_voxels=(0.04,), width=16, shared=8),
-        sampler=ShellSampler(radius=0.06, step=0.02, voxel=0.03, least_weight=1e-3),
+        sampler=ShellSampler(radius=0.06, step=0.02, voxel=0.03, min_weight=1e-3),
         losses=replace(start.method.losses, eikonal_points=64),
         pose=replace(start.method.pose, zero_until=3, refine_from=4, refine=("root", "body", "translation", "shape")),
         shell_refresh=12,

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from twofold.errors import TwofoldError
-from twofold.methods.base import Avatar, Subject
+from twofold.methods.base import Avatar
+from twofold.methods.subject import Subject
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,12 @@ import torch
 from small_recipes import CASES, LATE
 
 from twofold.geometry.cameras import pixel_grid, pixel_rays
-from twofold.methods.base import Subject
-from twofold.methods.placing import ShellSampler
+from twofold.methods.base import EVALUATION, Mode
+from twofold.methods.subject import Subject
 from twofold.metrics.perceptual import LPIPS
 from twofold.outputs.views import draw
 from twofold.sampling.error_bounded import ErrorBoundedSampler
+from twofold.sampling.shell_sampler import ShellSampler
 from twofold.training.pixels import PixelSource
 from twofold.training.run import load
 from twofold.volume.rendering import laplace_density
@@ -24,9 +25,9 @@ def subject(person):
     return Subject.of(person)
 
 
-def pose_of(avatar, person, which=1, **options):
+def pose_of(avatar, person, which=1, time=None, step=None):
     frame = person.train[which]
-    return avatar.pose(frame.pose, frame.translation, **options)
+    return avatar.pose(frame.pose, frame.translation, time, EVALUATION if step is None else Mode(step, step // 5))
 
 
 def rays_of(person, size=10):
@@ -54,8 +55,10 @@ def test_density_scale_never_falls_below_its_floor(subject, form):
 def test_epochs_of_the_zero_pose_are_moments_or_those_of_the_training(subject, person, epochs, length):
     pose = replace(QUICK.pose, epochs=epochs, zero_until=10, zero_every=3, drop=0.0)
     avatar = replace(QUICK, pose=pose).build(subject)
-    avatar.count_epochs(3)
-    shown = [bool(pose_of(avatar, person, step=step).condition.any()) for step in range(35)]
+    frame = person.train[1]
+    modes = [Mode(step, step // 3) for step in range(35)]
+    conditions = [avatar.pose(frame.pose, frame.translation, mode=mode).own.condition for mode in modes]
+    shown = [bool(condition.any()) for condition in conditions]
     assert shown == [step >= 10 and step // length % 3 != 0 for step in range(35)]
 
 
@@ -66,36 +69,36 @@ def test_poses_are_corrected_from_the_given_step_on_and_only_in_training_moments
     plain, time = pose_of(avatar, person), person.train[1].time
     moved = pose_of(avatar, person, time=time, step=5)
     torch.testing.assert_close(moved.body.joints - plain.body.joints, torch.tensor([0.1, 0, 0]).expand(24, 3))
-    assert moved.forward.requires_grad
-    assert not pose_of(avatar, person, time=time, step=4).forward.requires_grad
+    assert moved.own.surface.forward.requires_grad
+    assert not pose_of(avatar, person, time=time, step=4).own.surface.forward.requires_grad
     assert torch.equal(pose_of(avatar, person, time=1234).body.joints, plain.body.joints)
 
 
 @pytest.mark.parametrize("parts", [(), ("root",), ("body", "shape"), ("root", "body", "translation", "shape")])
 def test_only_the_parts_to_be_refined_learn(subject, person, parts):
     avatar = replace(QUICK, pose=replace(QUICK.pose, refine=parts)).build(subject)
-    group = avatar.parameter_groups()["pose"]
+    group = next(g.parameters for g in avatar.parameter_groups() if g.name == "pose")
     assert {id(p) for p in group} == {id(getattr(avatar.refinement, part)) for part in parts}
     posed = pose_of(avatar, person, time=1, step=LATE)
-    assert posed.forward.requires_grad == bool(parts)
+    assert posed.own.surface.forward.requires_grad == bool(parts)
 
 
 def test_shells_follow_corrections_only_at_a_refresh_and_then_with_the_shape(subject, person):
     avatar = replace(QUICK, shell_refresh=10).build(subject)
     time = person.train[1].time
-    before = pose_of(avatar, person, time=time, step=8).shell
+    before = pose_of(avatar, person, time=time, step=8).own.surface.shell
     with torch.no_grad():
         avatar.refinement.translation += 0.2
         avatar.refinement.shape += 1.0
-    avatar.before_step(9)
-    assert pose_of(avatar, person, time=time, step=9).shell is before
+    avatar.before_step(Mode(9))
+    assert pose_of(avatar, person, time=time, step=9).own.surface.shell is before
     # A resumed run builds the shell anew from what is stored, and must get the same one.
     resumed = replace(QUICK, shell_refresh=10).build(subject, 1)
     resumed.load_state_dict(avatar.state_dict())
-    assert torch.equal(pose_of(resumed, person, time=time, step=9).shell.vertices, before.vertices)
-    avatar.before_step(10)
+    assert torch.equal(pose_of(resumed, person, time=time, step=9).own.surface.shell.vertices, before.vertices)
+    avatar.before_step(Mode(10))
     after = pose_of(avatar, person, time=time, step=10)
-    torch.testing.assert_close(after.shell.vertices, after.body.vertices.detach(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(after.own.surface.shell.vertices, after.body.vertices.detach(), rtol=0, atol=1e-6)
 
 
 def trained_with(trained, **options):
@@ -113,7 +116,7 @@ def pictures(avatar, person):
 
 def test_error_bounded_and_shell_sampler_draw_the_same_picture(trained, person):
     """Within one step of 8 bits on average and twelve at any pixel, where both end at the same distance."""
-    shell = ShellSampler(radius=0.06, step=0.004, voxel=0.02, least_weight=0.0)
+    shell = ShellSampler(radius=0.06, step=0.004, voxel=0.02, min_weight=0.0)
     bounded = ErrorBoundedSampler(ends="ray")
     first, second = (
         pictures(trained_with(trained, sampler=s, outlier_distance=shell.radius), person) for s in (shell, bounded)
@@ -127,7 +130,7 @@ def test_error_bounded_and_shell_sampler_draw_the_same_picture(trained, person):
 def test_samples_left_out_for_their_small_weight_are_not_missed(trained, person):
     sampler = trained_with(trained).config.sampler
     all_, some = (
-        pictures(trained_with(trained, sampler=replace(sampler, least_weight=least)), person) for least in (0.0, 1e-3)
+        pictures(trained_with(trained, sampler=replace(sampler, min_weight=least)), person) for least in (0.0, 1e-3)
     )
     assert (all_.color - some.color).abs().max() < 0.02
 
@@ -167,18 +170,18 @@ def test_released_scene_units_thin_or_thicken_the_density(subject, person):
 
 def test_one_sample_composites_as_the_formula_says(subject, person):
     """Opacity of the shell sampler's ray by a plain loop over its samples."""
-    avatar = replace(QUICK, sampler=replace(QUICK.sampler, least_weight=0.0)).build(subject).eval()
+    avatar = replace(QUICK, sampler=replace(QUICK.sampler, min_weight=0.0)).build(subject).eval()
     rays, posed = rays_of(person), pose_of(avatar, person)
     with torch.no_grad():
         found = avatar.render(rays, posed, BLACK)
-        placed = avatar._place(rays, posed, None)
+        placed = avatar.place(rays, posed, EVALUATION, None)
         samples, nearest = placed.samples, placed.nearest
         which = int(torch.bincount(samples.ray_index).argmax())
         own = samples.ray_index == which
-        forward = posed.forward[nearest[own, 0]]
+        forward = posed.own.surface.forward[nearest[own, 0]]
         moved = samples.points(rays)[own]
         home = torch.stack([torch.linalg.solve(f[:, :3], x - f[:, 3]) for f, x in zip(forward, moved, strict=True)])
-        density = laplace_density(avatar.field.sdf(home, posed.condition), avatar.beta)
+        density = laplace_density(avatar.field.sdf(home, posed.own.condition), avatar.beta)
     light = 1.0
     for sigma, delta in zip(density.tolist(), samples.delta[own].tolist(), strict=True):
         light *= math.exp(-sigma * delta)
@@ -187,12 +190,13 @@ def test_one_sample_composites_as_the_formula_says(subject, person):
 
 
 def losses_of(recipe, avatar, person, step):
-    source = PixelSource(person.train, person.body, person.betas, recipe.training.pixels, person.background)
+    source = PixelSource(person.train, person.body, person.betas, recipe.training.pixels)
     generator = torch.Generator().manual_seed(0)
     frame, batch = person.train[1], source.draw(1, generator)
-    posed = avatar.pose(frame.pose, frame.translation, frame.time, step)
-    rendering = avatar.render(batch.rays, posed, torch.tensor(person.background), generator)
-    return avatar.losses(rendering, batch, posed, step, generator)
+    batch, mode = batch.against(torch.tensor(person.background)), Mode(step, step // 5)
+    posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
+    rendering = avatar.render(batch.rays, posed, batch.background, mode, generator)
+    return avatar.losses(rendering, batch, posed, mode, generator)
 
 
 def test_perceptual_network_is_used_from_its_step_on_and_is_no_part_of_the_avatar(subject, person):
@@ -203,7 +207,7 @@ def test_perceptual_network_is_used_from_its_step_on_and_is_no_part_of_the_avata
     network = LPIPS(((4,), (8,)))
     for parameter in network.parameters():
         torch.nn.init.uniform_(parameter, 0.1, 0.2)
-    avatar.attach_lpips(network)
+    avatar.attach_perceptual(network)
     assert list(avatar.state_dict()) == before
     assert "lpips" not in losses_of(recipe, avatar, person, recipe.method.losses.lpips_start - 1)
     terms = losses_of(recipe, avatar, person, recipe.method.losses.lpips_start)

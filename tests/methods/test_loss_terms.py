@@ -30,11 +30,13 @@ def a_batch(singles=30, size=16):
     zeros = torch.zeros(count)
     return Batch(
         rays=Rays(torch.zeros(count, 3), torch.ones(count, 3), zeros, zeros),
-        color=torch.rand(count, 3, generator=seeded(1)),
+        image=torch.rand(count, 3, generator=seeded(1)),
         mask=torch.rand(count, generator=seeded(2)).round(decimals=1),
         singles=singles,
         patch_pixels=pixels,
-        patch_color=torch.rand(1, size, size, 3, generator=seeded(3)),
+        patch_image=torch.rand(1, size, size, 3, generator=seeded(3)),
+        patch_mask=torch.rand(1, size, size, generator=seeded(8)),
+        frame_index=0,
         background=BACKGROUND,
     )
 

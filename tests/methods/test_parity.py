@@ -11,9 +11,9 @@ from torch.nn import functional as F
 from twofold.body.skeleton import joint_transforms, pose_body, shape_body
 from twofold.geometry.cameras import Rays, pixel_grid, pixel_rays
 from twofold.geometry.rotations import rigid_inverse
-from twofold.methods.base import Subject
+from twofold.methods.base import EVALUATION, Mode
 from twofold.methods.factorized_recipes import paper, released
-from twofold.methods.placing import place_error_bounded
+from twofold.methods.subject import Subject
 
 METHOD = CASES["released"].method
 BLACK = torch.zeros(3)
@@ -45,10 +45,15 @@ def rays(person):
     return pixel_rays(camera, pixel_grid(camera).flatten(0, 1))
 
 
+def at(step):
+    """Of a training whose epochs have three steps."""
+    return Mode(step, step // 3, step % 3 == 0)
+
+
 def in_training(avatar, person, step):
     frame = person.train[1]
     with torch.no_grad():
-        return avatar.pose(frame.pose, frame.translation, frame.time, step)
+        return avatar.pose(frame.pose, frame.translation, frame.time, at(step))
 
 
 def scene_matrices(avatar, person):
@@ -84,9 +89,8 @@ def weights_of(points, vertices, table, k):
 def test_points_and_normals_move_by_the_programs_matrices(avatar, person, step, k):
     """Shape corrections leave the canonical side alone; K is 7 after epoch 100, in scene units; normals turn by the
     nearest canonical vertices."""
-    avatar.count_epochs(3)
     posed = in_training(avatar, person, step)
-    assert posed.neighbours == k
+    assert posed.own.surface.neighbours == k
     matrices, vertices, _ = scene_matrices(avatar, person)
     generator = torch.Generator().manual_seed(1)
     which = torch.randint(len(vertices), (60,), generator=generator)
@@ -106,24 +110,22 @@ def test_points_and_normals_move_by_the_programs_matrices(avatar, person, step, 
 
 
 def test_neighbours_are_one_in_tests_and_before_the_first_validation(avatar, person):
-    avatar.count_epochs(3)
     frame = person.train[1]
-    assert [in_training(avatar, person, step).neighbours for step in (0, 299, 300, 5000)] == [1, 1, 7, 7]
-    assert avatar.pose(frame.pose, frame.translation).neighbours == 1
-    assert avatar.pose(frame.pose, frame.translation, frame.time).neighbours == 1
+    assert [in_training(avatar, person, step).own.surface.neighbours for step in (0, 299, 300, 5000)] == [1, 1, 7, 7]
+    assert avatar.pose(frame.pose, frame.translation).own.surface.neighbours == 1
+    assert avatar.pose(frame.pose, frame.translation, frame.time).own.surface.neighbours == 1
 
 
 def test_canonical_vertices_of_normals_follow_the_shape_at_each_validation_and_are_stored(subject, person):
     avatar = METHOD.build(subject, 3)
-    avatar.count_epochs(3)
     anchors = {}
     for step in range(0, 605, 5):
         with torch.no_grad():
             avatar.refinement.shape.fill_(step / 1000)
-        for at in range(step, step + 5):
-            avatar.before_step(at)
+        for each in range(step, step + 5):
+            avatar.before_step(at(each))
         if step in (0, 295, 300, 595, 600):
-            anchors[step] = in_training(avatar, person, step).anchors
+            anchors[step] = in_training(avatar, person, step).own.anchors
     given, start = shape_body(person.body, person.betas), torch.zeros(24, 3)
     for step, shape in ((0, 0.0), (295, 0.0), (300, 0.3), (595, 0.3), (600, 0.6)):
         shaped = shape_body(person.body, person.betas + shape) if shape else given
@@ -132,7 +134,7 @@ def test_canonical_vertices_of_normals_follow_the_shape_at_each_validation_and_a
     resumed.load_state_dict(avatar.state_dict())
     assert torch.equal(resumed.late_shape, avatar.late_shape)
     assert avatar.late_shape.max() > 0
-    assert torch.equal(avatar.pose(start, start[0]).anchors, avatar.canonical_points), "tests begin anew"
+    assert torch.equal(avatar.pose(start, start[0]).own.anchors, avatar.canonical_points), "tests begin anew"
 
 
 def test_tests_have_the_shape_as_given_and_training_moments_the_corrected_one(avatar, person):
@@ -151,7 +153,7 @@ def test_box_is_around_the_joints_as_given_by_30_centimetres_and_a_hundredth_of_
     low = [min(joint[i] for joint in joints.tolist()) - 0.3 - 0.01 / SCALE for i in range(3)]
     high = [max(joint[i] for joint in joints.tolist()) + 0.3 + 0.01 / SCALE for i in range(3)]
     posed = in_training(avatar, person, 50)
-    torch.testing.assert_close(posed.box, torch.tensor([low, high]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(posed.own.surface.box, torch.tensor([low, high]), atol=1e-6, rtol=0)
     moved = posed.body.joints.amin(0) - torch.tensor(low)
     assert (moved - 0.3 - 0.01 / SCALE).abs().max() > 0.003, "the pose was not corrected"
 
@@ -169,7 +171,7 @@ def literal_opacity(avatar, person, rays, training, seed):
         return torch.linalg.solve(blended, whole[..., None])[:, :3, 0].float()
 
     def sdf(points):
-        values = avatar.field.sdf(canonical(points), posed.condition)
+        values = avatar.field.sdf(canonical(points), posed.own.condition)
         if training:
             return values
         away = torch.cdist(points.double(), vertices).amin(1)
@@ -200,7 +202,7 @@ def literal_opacity(avatar, person, rays, training, seed):
         opacity = torch.zeros(len(rays))
         for row, ray in enumerate(kept):
             points = seen.origins[row] + depth[row][:, None] * seen.directions[row]
-            values, passed = avatar.field.sdf(canonical(points), posed.condition), 1.0
+            values, passed = avatar.field.sdf(canonical(points), posed.own.condition), 1.0
             for s, length in zip(values.tolist(), delta[row].tolist(), strict=True):
                 tail = 0.5 * math.exp(-abs(s) / float(beta))
                 alpha = 1 - math.exp(-(tail if s > 0 else 1 - tail) / float(beta) * length)
@@ -216,16 +218,11 @@ def test_rays_are_sampled_and_shaded_in_scene_units(avatar, person, rays, traini
     posed = in_training(avatar, person, 0)
     noise = torch.Generator().manual_seed(5) if training else None
 
-    def distance(x):
-        return avatar.field.sdf(x, posed.condition)
-
+    mode = at(0) if training else EVALUATION
     with torch.no_grad():
-        beta = avatar.beta
-        placed = place_error_bounded(
-            METHOD.sampler, rays, posed, avatar._weigh, 0.1 / SCALE, noise, distance, beta, SCALE
-        )
+        placed = avatar.place(rays, posed, mode, noise)
         noise = torch.Generator().manual_seed(5) if training else None
-        found = avatar.render(rays, posed, BLACK, noise).opacity
+        found = avatar.render(rays, posed, BLACK, mode, noise).opacity
     assert torch.equal(placed.samples.ray_index, kept.repeat_interleave(depth.shape[1]))
     torch.testing.assert_close(SCALE * placed.samples.depth, depth.flatten(), atol=2e-5, rtol=0)
     torch.testing.assert_close(SCALE * placed.samples.delta, delta.flatten(), atol=2e-5, rtol=0)

@@ -10,22 +10,18 @@ from hypothesis import strategies as st
 from little_body import little_body, moved_pose, posed_little_body
 
 from twofold.body.skeleton import canonical_pose, pose_body, shape_body
-from twofold.deform.skinning import vertex_transforms
 from twofold.geometry.cameras import Camera, clip_to_box, pixel_grid, pixel_rays, project
 from twofold.geometry.rotations import axis_angle_to_matrix
-from twofold.methods.base import Avatar, PosedAvatar, Rendering
-from twofold.methods.placing import joint_box
+from twofold.methods.base import EVALUATION, Avatar, PosedAvatar, Rendering
 from twofold.outputs.views import body_up, draw, look_at, orbit, pose_canonically, rays_at_once
-from twofold.sampling.shell import build_shell
 
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 SHAPED = shape_body(little_body(spacing=0.1), torch.zeros(1))
-SHELL = build_shell(SHAPED.vertices, SHAPED.faces, 0.06, 0.1)
 
 
 def as_avatar(body):
-    """Pictures of `Painted` ask for the body alone."""
-    return PosedAvatar(body, vertex_transforms(body), body.pose[1:].flatten(), SHELL, joint_box(body.joints))
+    """`Painted` derives nothing else from a pose."""
+    return PosedAvatar(body, None)
 
 
 class Painted(Avatar):
@@ -35,10 +31,10 @@ class Painted(Avatar):
         super().__init__()
         self.with_base, self.asked = with_base, []
 
-    def pose(self, pose, translation, time=None, step=None):
+    def pose(self, pose, translation, frame_index=None, mode=EVALUATION):
         return as_avatar(pose_body(SHAPED, pose, translation))
 
-    def render(self, rays, posed, background, generator=None):
+    def render(self, rays, posed, background, mode=EVALUATION, generator=None):
         assert generator is None, "pictures have no noise"
         assert not torch.is_grad_enabled()
         self.asked.append(rays)
@@ -46,17 +42,14 @@ class Painted(Avatar):
         base = Rendering(background + 0 * color, rays.near, rays.far, -rays.directions) if self.with_base else None
         return Rendering(color, 0.5 + 0 * rays.near, rays.near, rays.directions, base)
 
-    def losses(self, rendering, batch, posed, step, generator):
+    def losses(self, rendering, batch, posed, mode, generator):
         return {}
 
-    def level(self, x_canonical, posed, branch="full"):
-        return x_canonical[:, 0]
-
-    def before_step(self, step):
-        pass
+    def level(self, x, posed, branch="full"):
+        return x[:, 0]
 
     def parameter_groups(self):
-        return {}
+        return []
 
 
 def some_pose(seed=0, size=0.3):

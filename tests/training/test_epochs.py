@@ -20,7 +20,7 @@ def test_released_epochs_are_whole_steps_that_fill_up_with_the_first_pictures_ag
     recipe = released()
     length = (frames + 1) // 2
     assert epoch_steps(recipe.training, frames) == length
-    shown = [frame for step in range(3 * length) for frame in frame_order(recipe, frames, step)]
+    shown = [frame for step in range(3 * length) for frame in frame_order(recipe.training, recipe.seed, frames, step)]
     for epoch in range(3):
         order = shuffled(0, epoch, frames)
         expected = order + order[: 2 * length - frames]
@@ -29,7 +29,7 @@ def test_released_epochs_are_whole_steps_that_fill_up_with_the_first_pictures_ag
 
 def test_epochs_by_pictures_show_each_exactly_once_across_steps():
     recipe = replace(quick(), training=replace(quick().training, images_per_step=2))
-    shown = [frame for step in range(15) for frame in frame_order(recipe, 5, step)]
+    shown = [frame for step in range(15) for frame in frame_order(recipe.training, recipe.seed, 5, step)]
     assert shown == [frame for epoch in range(6) for frame in shuffled(0, epoch, 5)]
     assert epoch_steps(recipe.training, 5) == 2.5
 

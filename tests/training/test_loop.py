@@ -60,7 +60,7 @@ def recipe_of(steps: int, **training: object) -> Recipe:
 
 def run_script(capture: Path, folder: Path, steps: int) -> subprocess.Popen[bytes]:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    tests = str(Path(__file__).resolve().parents[1])
+    tests = str(Path(__file__).resolve().parents[1] / "helpers")
     command = [sys.executable, "-c", SCRIPT, str(capture), str(folder), str(steps), tests]
     with (folder.parent / "errors.txt").open("wb") as errors:
         return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=errors)
@@ -218,7 +218,7 @@ for choice in ("never", "always"):
 @pytest.mark.slow
 def test_compiled_networks_learn_what_plain_ones_do(person: Capture, tmp_path: Path) -> None:
     """In a process of its own, since a compiler cannot look into functions whose shapes are being checked."""
-    tests = str(Path(__file__).resolve().parents[1])
+    tests = str(Path(__file__).resolve().parents[1] / "helpers")
     command = [sys.executable, "-c", COMPILING, str(person.folder), str(tmp_path), tests]
     subprocess.run(command, check=True)
     plain, compiled = (state(tmp_path / choice) for choice in ("never", "always"))

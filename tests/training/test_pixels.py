@@ -45,7 +45,7 @@ def pixels_seen_by(camera, batch):
 @pytest.mark.parametrize("surroundings", [None, 4])
 def test_ignored_pixels_are_never_drawn(hidden, surroundings):
     config = PixelConfig(rays=500, surroundings=surroundings, patches=3, patch_size=12)
-    source = PixelSource(hidden.train, hidden.body, hidden.betas, config, hidden.background)
+    source = PixelSource(hidden.train, hidden.body, hidden.betas, config)
     generator = torch.Generator().manual_seed(0)
     left_out = 0
     for _ in range(5):
@@ -65,15 +65,15 @@ def test_ignored_pixels_are_never_drawn(hidden, surroundings):
 def test_a_picture_that_ignores_all_of_the_person_is_one_sentence(hidden, tmp_path):
     layer = np.full((HEIGHT, WIDTH), 255, np.uint8)
     capture = read_capture(write_tiny(tmp_path / "tiny", ignored={("front", 0): layer}))
-    source = PixelSource(capture.train, capture.body, capture.betas, PixelConfig(), capture.background)
+    source = PixelSource(capture.train, capture.body, capture.betas, PixelConfig())
     with pytest.raises(TwofoldError, match="ignores all of the person"):
         source.picture(0)
 
 
 def test_nothing_ignored_draws_as_if_there_were_no_layer(hidden):
     plain = tuple(replace(frame, ignored_file=None) for frame in hidden.train)
-    empty = PixelSource(hidden.train, hidden.body, hidden.betas, PixelConfig(), hidden.background)
-    without = PixelSource(plain, hidden.body, hidden.betas, PixelConfig(), hidden.background)
+    empty = PixelSource(hidden.train, hidden.body, hidden.betas, PixelConfig())
+    without = PixelSource(plain, hidden.body, hidden.betas, PixelConfig())
     first, second = (s.draw(2, torch.Generator().manual_seed(3)) for s in (empty, without))
     torch.testing.assert_close(first.color, second.color, rtol=0, atol=0)
     torch.testing.assert_close(first.rays.directions, second.rays.directions, rtol=0, atol=0)
@@ -93,8 +93,11 @@ def noisy(tmp_path_factory):
     return replace(capture, splits={"train": (frame,)})
 
 
-def source_of(capture, background=(0.1, 0.5, 0.9), margin=0.2, **options):
-    return PixelSource(capture.train, capture.body, capture.betas, PixelConfig(**options), background, margin)
+BACKGROUND = torch.tensor([0.1, 0.5, 0.9])
+
+
+def source_of(capture, margin=0.2, **options):
+    return PixelSource(capture.train, capture.body, capture.betas, PixelConfig(**options), margin)
 
 
 def seeded(seed=0):
@@ -118,7 +121,7 @@ def brute_reachable(capture, margin):
 
 
 def test_rays_see_the_picture_on_the_background_at_their_own_pixels(noisy):
-    batch = source_of(noisy).draw(0, seeded())
+    batch = source_of(noisy).draw(0, seeded()).against(BACKGROUND)
     rows, columns = pixels_seen_by(noisy.train[0].camera, batch)
     image, mask = noisy.train[0].image(), noisy.train[0].mask()
     for i in range(0, len(batch.mask), 7):
@@ -251,7 +254,7 @@ def test_batches_go_to_the_device(noisy, device):
     assert torch.equal(there.color.cpu(), batch.color)
 
 
-RELEASED = {"reachable": "box", "subject": "any", "replacement": False, "rounded": False}
+RELEASED = {"reachable": "box", "subject": "any", "replacement": False}
 
 
 def literal_box_hits(frame, joints, margin):
@@ -285,7 +288,7 @@ def far(noisy):
 
 def test_released_pools_are_the_box_of_the_joints_and_the_mask_without_its_last_row_and_column(far):
     frame, config = far.train[0], PixelConfig(**RELEASED)
-    source = PixelSource(far.train, far.body, far.betas, config, far.background, box_margin=0.3142)
+    source = PixelSource(far.train, far.body, far.betas, config, box_margin=0.3142)
     joints = pose_body(shape_body(far.body, far.betas), frame.pose, frame.translation).joints
     hit = literal_box_hits(frame, joints, 0.3142)
     assert 0.1 < hit.float().mean() < 0.9
@@ -300,8 +303,8 @@ def test_released_pools_are_the_box_of_the_joints_and_the_mask_without_its_last_
 
 def test_released_pixels_are_drawn_once_and_not_rounded(far):
     frame, config = far.train[0], PixelConfig(rays=300, patches=3, patch_size=12, subject_share=0.7, **RELEASED)
-    source = PixelSource(far.train, far.body, far.betas, config, (0.1, 0.5, 0.9))
-    batch = source.draw(0, seeded())
+    source = PixelSource(far.train, far.body, far.betas, config)
+    batch = source.draw(0, seeded()).against(torch.tensor([0.1, 0.5, 0.9]))
     rows, columns = pixels_seen_by(frame.camera, batch)
     flat = (rows * WIDTH + columns).tolist()
     assert len(set(flat[:210])) == 210
@@ -314,15 +317,15 @@ def test_released_pixels_are_drawn_once_and_not_rounded(far):
 
 def test_a_pool_smaller_than_the_draw_is_drawn_with_replacement(far):
     config = PixelConfig(rays=3000, patches=0, subject_share=1.0, **RELEASED)
-    assert len(PixelSource(far.train, far.body, far.betas, config, far.background).draw(0, seeded()).mask) == 3000
+    assert len(PixelSource(far.train, far.body, far.betas, config).draw(0, seeded()).mask) == 3000
 
 
 @pytest.mark.parametrize("options", [{}, RELEASED])
 def test_patches_show_the_picture_where_no_ray_goes_and_fill_what_is_rendered_there(far, options):
     frame, background = far.train[0], torch.tensor([0.1, 0.5, 0.9])
     config = PixelConfig(patches=30, patch_size=20, **options)
-    source = PixelSource(far.train, far.body, far.betas, config, tuple(background.tolist()), margin=0.1)
-    batch = source.draw(0, seeded())
+    source = PixelSource(far.train, far.body, far.betas, config, margin=0.1)
+    batch = source.draw(0, seeded()).against(background)
     rows, columns = pixels_seen_by(frame.camera, batch)
     share = frame.mask()[..., None]
     whole = frame.image() * share + background * (1 - share)
@@ -343,8 +346,8 @@ def test_patches_show_the_picture_where_no_ray_goes_and_fill_what_is_rendered_th
 
 def test_ignored_pixels_of_a_patch_are_background_in_the_picture_too(hidden):
     config = PixelConfig(patches=20, patch_size=12, patch_on_subject=1.0)
-    source = PixelSource(hidden.train, hidden.body, hidden.betas, config, (0.1, 0.5, 0.9), margin=9.0)
-    batch = source.draw(1, seeded())
+    source = PixelSource(hidden.train, hidden.body, hidden.betas, config, margin=9.0)
+    batch = source.draw(1, seeded()).against(BACKGROUND)
     off = batch.patch_pixels < 0
     assert off.any()
     assert (batch.patch_color[off] == torch.tensor([0.1, 0.5, 0.9])).all()

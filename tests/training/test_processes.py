@@ -22,7 +22,7 @@ from twofold.training.loop import train
 from twofold.training.processes import Team, announced
 from twofold.training.run import read_checkpoint
 
-TESTS = str(Path(__file__).resolve().parents[1])
+TESTS = str(Path(__file__).resolve().parents[1] / "helpers")
 SCRIPT = """
 import sys, torch
 from pathlib import Path

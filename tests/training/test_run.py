@@ -11,8 +11,8 @@ from tiny_person import tiny_recipe
 
 from twofold.config import with_overrides
 from twofold.errors import TwofoldError
-from twofold.methods.base import Subject
 from twofold.methods.factorized_recipes import quick, released
+from twofold.methods.subject import Subject
 from twofold.training.loop import make_optimizer
 from twofold.training.run import (
     choose_device,
@@ -244,7 +244,7 @@ def test_automatic_device_is_the_gpu_where_there_is_one():
 @pytest.mark.parametrize(
     "setting",
     [
-        "training.steps=0", "training.images_per_step=0", "training.rate_low=-1", "training.checkpoint_every=0",
+        "training.steps=0", "training.images_per_step=0", "method.rates.low=-1", "training.checkpoint_every=0",
         "training.preview_every=-1", "training.adam_betas=0.9,1.0", "training.clip=-1", "training.steps=many",
         "method.sampler.refined=1", "method.neighbours=0", "method.beta=0", "method.losses.mask=-0.1",
         "method.shell_refresh=0", "training.steps=1e99", "training.pixels.rays=-1", "training.pixels.rays=0",
@@ -268,7 +268,7 @@ def test_settings_with_which_nothing_can_be_trained_are_refused_by_name(setting)
         "method.field.low_voxels=0", "method.field.low_voxels=", "method.field.low_voxels=0.1,1e-9",
         "method.field.high_voxels=", "method.field.features=0", "method.field.shared=0", "method.field.pose_code=0",
         "method.field.radius=99", "method.field.gate_width=0", "method.sampler.voxel=1e-9", "method.sampler.step=1e-7",
-        "method.sampler.table_voxel=1e-5", "method.sampler.radius=0",
+        "method.sampler.sdf_grid_voxel=1e-5", "method.sampler.radius=0",
     ],
 )  # fmt: skip
 def test_grids_and_shells_that_fill_any_memory_or_hold_nothing_are_refused_by_name(setting):

@@ -54,6 +54,11 @@ class Frame:
         """Share of each pixel that the person covers, 0..1."""
         return torch.from_numpy(read_grey(self.mask_file).astype(np.float32) / 255)
 
+    def composited(self, background: Float[Tensor, "3"]) -> Float[Tensor, "h w 3"]:
+        """The person on a background colour, 0..1: the one place where an image meets a background."""
+        mask = self.mask()[..., None]
+        return self.image() * mask + background * (1 - mask)
+
     def ignored(self) -> Bool[Tensor, "h w"]:
         """Pixels that are neither learned from nor measured, because something passes in front of the person."""
         if self.ignored_file is None:

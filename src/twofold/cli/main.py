@@ -24,16 +24,16 @@ from twofold.cli.streams import streams_that_never_fail
 from twofold.errors import TwofoldError
 
 if TYPE_CHECKING:
+    from twofold.methods.base import Avatar
     from twofold.recipe import Recipe
 
 Parts = Literal["all", "orbit", "views", "poses", "canonical"]
-Recipes = Literal["quick", "fast", "released", "paper"]
 
 
 def train(
     capture: Annotated[Path | None, tyro.conf.Positional] = None,
     out: Path | None = None,
-    recipe: Recipes = "quick",
+    recipe: str = "quick",
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     seed: int = 0,
     device: str = "auto",
@@ -82,7 +82,7 @@ def train(
             loop.train(
                 read, chosen, folder, where, resume is not None,
                 lambda p: show(p.step / p.steps, f"step {p.step}  loss {sum(p.losses.values()):.4f}  {p.psnr:.1f} dB"),
-                _attach_lpips,
+                _attach_perceptual,
                 lambda avatar, step: save_preview(avatar, read, folder, step),
                 lambda note: console().print(note, soft_wrap=True),
             )  # fmt: skip
@@ -97,20 +97,19 @@ def train(
     say(f"The avatar is in {folder}.", _with_capture(["twofold", "render", str(folder)], moved))
 
 
-def _show_settings(recipe: Recipes, overrides: tuple[str, ...], seed: int) -> None:
+def _show_settings(recipe: str, overrides: tuple[str, ...], seed: int) -> None:
     """Every setting on a line of standard output."""
-    from twofold.config import describe, with_overrides
-    from twofold.methods.table import RECIPES
+    from twofold.config import describe
+    from twofold.methods.table import RECIPES, with_settings
 
-    print("\n".join(describe(with_overrides(RECIPES[recipe](), [f"seed={seed}", *overrides]))))
+    print("\n".join(describe(with_settings(RECIPES[recipe](), [f"seed={seed}", *overrides]))))
 
 
 def _new_run(
-    capture: Path | None, out: Path | None, recipe: Recipes, overrides: tuple[str, ...], seed: int
+    capture: Path | None, out: Path | None, recipe: str, overrides: tuple[str, ...], seed: int
 ) -> "tuple[Recipe, Path, Path]":
     """Recipe, folder and capture of a run to begin."""
-    from twofold.config import with_overrides
-    from twofold.methods.table import RECIPES
+    from twofold.methods.table import RECIPES, with_settings
     from twofold.training.run import require_free
 
     if capture is None:
@@ -118,18 +117,17 @@ def _new_run(
     require_capture(capture)
     folder = out or Path("runs") / f"{capture.resolve().name}-{recipe}"
     require_free(folder)
-    return with_overrides(RECIPES[recipe](), [f"seed={seed}", *overrides]), folder, capture
+    return with_settings(RECIPES[recipe](), [f"seed={seed}", *overrides]), folder, capture
 
 
-def _attach_lpips(avatar: object) -> str | None:
+def _attach_perceptual(avatar: "Avatar") -> str | None:
     """Gives the avatar its perceptual loss where its recipe has one; tells whether it has it."""
-    from twofold.methods.factorized import FactorizedAvatar
     from twofold.metrics.perceptual import load_lpips, weights_hint
 
-    if not isinstance(avatar, FactorizedAvatar) or not avatar.config.losses.lpips:
+    if not avatar.wants_perceptual:
         return None
     network = load_lpips()
-    avatar.attach_lpips(network)
+    avatar.attach_perceptual(network)
     return weights_hint() if network is None else "LPIPS is part of the loss."
 
 
@@ -256,6 +254,16 @@ COMMANDS: dict[str, Callable[..., None]] = {
 }
 
 
+def _offer_recipes() -> None:
+    """Lets `--recipe` take the names in the table of methods. It imports torch, so only `train` does it."""
+    from twofold.kernels.runtime import tune_process
+
+    tune_process()
+    from twofold.methods.table import RECIPES
+
+    train.__annotations__["recipe"] = Literal[tuple(RECIPES)]
+
+
 def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     """The command with the same arguments, to be run when they have all been read."""
 
@@ -309,6 +317,8 @@ def _run(words: list[str]) -> None:
         if words == ["--version"]:
             print(f"twofold {__version__}")
             return
+        if words[:1] == ["train"]:
+            _offer_recipes()
         command = tyro.extras.subcommand_cli_from_dict(
             {name: _later(command) for name, command in COMMANDS.items()}, prog="twofold",
             args=_one_by_one(_renamed(words)),

@@ -1,10 +1,32 @@
 """Corrections to estimated poses, learned along with the avatar."""
 
+from typing import Protocol, runtime_checkable
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+
+
+@runtime_checkable
+class KnownPoses(Protocol):
+    """Frames in ascending order with their poses."""
+
+    @property
+    def times(self) -> Int[Tensor, "T"]:
+        """Frame indices."""
+        ...
+
+    @property
+    def poses(self) -> Float[Tensor, "T 24 3"]:
+        """Axis-angle, radians."""
+        ...
+
+    @property
+    def translations(self) -> Float[Tensor, "T 3"]:
+        """Metres."""
+        ...
 
 
 class PoseRefinement(nn.Module):
@@ -40,6 +62,29 @@ class PoseRefinement(nn.Module):
         if row is None or not self.parts:
             return pose, translation
         return pose + torch.cat([self.root[row], self.body[row]]), translation + self.translation[row]
+
+    def at(
+        self, time: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], known: KnownPoses,
+        max_gap: float,
+    ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:  # fmt: skip
+        """A frame's corrected pose: by its own correction, or by its neighbours' (`between`), or as given.
+
+        Args:
+            time: the frame.
+            pose: as given, radians.
+            translation: as given, metres.
+            known: the training frames with their poses as given.
+            max_gap: largest number of frames between the neighbours.
+        """
+        times = known.times.tolist()
+        if time in self.rows or not self.parts or not times[0] < time < times[-1]:
+            return self(time, pose, translation)
+        after = next(row for row, other in enumerate(times) if other > time)
+        before = after - 1
+        if times[after] - times[before] > max_gap:
+            return pose, translation
+        neighbours = tuple((times[r], known.poses[r].to(pose), known.translations[r].to(pose)) for r in (before, after))
+        return self.between(neighbours, time, pose, translation)
 
     def between(
         self,

@@ -1,13 +1,13 @@
 """From posed to canonical space and back, by the skinning of the nearest body vertices."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from twofold.body.skeleton import PosedBody
-from twofold.kernels.sparse_rows import weighted_rows
+from twofold.kernels.sparse_rows import scatter_rows, weighted_rows
 
 
 def inverse_skinning(
@@ -143,10 +143,65 @@ def to_canonical(
     Returns:
         canonical points, and J^-T of the skinning: a canonical gradient times it is the gradient in observation space.
     """
+    x_canonical, rows = map_to_canonical(x_posed, nearest, shares, forward)
+    return x_canonical, rows[..., :3].transpose(-1, -2)
+
+
+def map_to_canonical(
+    x_posed: Float[Tensor, "S 3"],
+    nearest: Int[Tensor, "S K"],
+    shares: Float[Tensor, "S K"],
+    forward: Float[Tensor, "V 3 4"],
+) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 4"]]:
+    """Canonical points as `to_canonical` gives them, and each sample's whole posed-to-canonical transform."""
     rows = _inverse_rows(nearest, shares, forward)
     # A product of the whole batch with elementwise sums: batched 3x3 matrix products are slow on CPUs.
-    x_canonical = (rows[..., :3] * x_posed[:, None, :]).sum(-1) + rows[..., 3]
-    return x_canonical, rows[..., :3].transpose(-1, -2)
+    return (rows[..., :3] * x_posed[:, None, :]).sum(-1) + rows[..., 3], rows
+
+
+class _WithPoseGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, forward: Tensor, x_canonical: Tensor, inverse: Tensor, nearest: Tensor, weights: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        ctx.save_for_backward(x_canonical, inverse, nearest, weights)
+        ctx.vertices = forward.shape[0]
+        return x_canonical.clone(), inverse[..., :3].transpose(-1, -2).contiguous()
+
+    @staticmethod
+    def backward(ctx: Any, by_x: Tensor, by_transposed: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        x_canonical, inverse, nearest, weights = ctx.saved_tensors
+        transposed = inverse[..., :3].transpose(-1, -2)
+        # x_c = R^-1 (x_o - t):  d/dR = -(R^-T g) x_c^T,  d/dt = -R^-T g.
+        pulled = (transposed * by_x[:, None, :]).sum(-1)
+        by_rows = -pulled[:, :, None] * torch.cat([x_canonical, torch.ones_like(x_canonical[:, :1])], -1)[:, None, :]
+        # The transform's inverse: d/dR = -R^-T G R^-T, with G the gradient by R^-1.
+        by_rows[..., :3] -= transposed @ by_transposed.transpose(-1, -2) @ transposed
+        summed = scatter_rows(by_rows.flatten(1), nearest, weights, ctx.vertices)
+        return summed.unflatten(-1, (3, 4)), None, None, None, None
+
+
+def with_pose_gradient(
+    x_canonical: Float[Tensor, "S 3"],
+    inverse: Float[Tensor, "S 3 4"],
+    nearest: Int[Tensor, "S K"],
+    weights: Float[Tensor, "S K"],
+    forward: Float[Tensor, "V 3 4"],
+) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 3"]]:
+    """What `to_canonical` returns, from results of `map_to_canonical` without gradients; differentiable by `forward`.
+
+    Samplers map samples once to choose among them; nothing is computed again for the samples that are kept.
+
+    Args:
+        x_canonical: of the samples that are kept, metres.
+        inverse: their posed-to-canonical transforms.
+        nearest: their K nearest posed vertices.
+        weights: weight of each of these.
+        forward: `vertex_transforms` of the posed body, which both were computed from.
+    """
+    if not (torch.is_grad_enabled() and forward.requires_grad):
+        return x_canonical, inverse[..., :3].transpose(-1, -2)
+    return _WithPoseGradient.apply(forward, x_canonical, inverse, nearest, weights)  # type: ignore[return-value]
 
 
 def normal_matrices(

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from twofold.body.skeleton import PosedBody
 from twofold.config import require_within
 from twofold.field.branches import Branch, BranchNetworks, Geometry, ReadyBranch
 from twofold.field.encoding import encoding_size, fourier_encoding
@@ -111,13 +112,20 @@ class FactorizedFieldConfig:
                 f"layers of width={self.width}; widen them or set high_skip=None"
             )
 
-    def build(self, pose_size: int = 69, generator: torch.Generator | None = None) -> "FactorizedField":
-        """A new field for poses of `pose_size` numbers, its start drawn from `generator`."""
+    def build(
+        self, body: PosedBody | None = None, pose_size: int = 69, generator: torch.Generator | None = None
+    ) -> "FactorizedField":
+        """A new field for poses of `pose_size` numbers, its start drawn from `generator`; the body is not used."""
         return FactorizedField(self, pose_size, generator)
 
 
 class FactorizedField(nn.Module):
     """Signed distance and colour at points of canonical space, for one pose at a time."""
+
+    dense = True
+    """Each query passes through large networks."""
+    separates_light = False
+    """Colours include the lighting."""
 
     def __init__(self, config: FactorizedFieldConfig, pose_size: int, generator: torch.Generator | None = None) -> None:
         super().__init__()
@@ -175,6 +183,10 @@ class FactorizedField(nn.Module):
         """Parameters of the "low" and of the "high" branch, which learn at different rates; empty for one left out."""
         branches = {"low": self.low, "high": self.high}
         return {name: [] if branch is None else list(branch.parameters()) for name, branch in branches.items()}
+
+    def unlit(self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> FieldOutput:
+        """Not to be had: the networks' colours include the lighting."""
+        raise ValueError("colours of dense networks include the lighting; ask for them with lit=True")
 
     def at(self, pose: Float[Tensor, "P"]) -> tuple[ReadyBranch | None, ReadyBranch | None]:
         """Both branches at one pose; their matrices are multiplied out here, once a call."""

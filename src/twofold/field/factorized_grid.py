@@ -118,6 +118,11 @@ class _Geometry:
 class GridField(nn.Module):
     """See `GridFieldConfig`; answers like `factorized.FactorizedField`."""
 
+    dense = False
+    """A query is a few table lookups and small networks."""
+    separates_light = True
+    """Colours can be had without the lighting."""
+
     def __init__(
         self, config: GridFieldConfig, body: PosedBody, pose_size: int, generator: torch.Generator | None
     ) -> None:

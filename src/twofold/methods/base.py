@@ -1,154 +1,158 @@
-"""What every method promises: an avatar that can be posed, rendered, trained and turned into a surface."""
+"""What every method promises: an avatar that can be posed, rendered, trained and turned into a surface.
+
+Everything above `methods` uses only what stands here, so it never knows which method it has.
+"""
 
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Generic, Literal, TypeVar
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from twofold.body.skeleton import Body, PosedBody
+from twofold.body.skeleton import PosedBody
 from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
-from twofold.npz import are_moderate
-from twofold.sampling.shell import Shell
+from twofold.methods.subject import Subject
+from twofold.metrics.perceptual import LPIPS
+from twofold.recipe import TrainingConfig
+
+Own = TypeVar("Own")
 
 
 @dataclass(frozen=True)
-class Subject:
-    """The person that an avatar is made of: body and training motion. A run folder carries it as arrays.
+class Mode:
+    """Whether an avatar is trained or evaluated. A random generator decides randomness only.
 
     Attributes:
-        body: the body model.
-        betas: its shape coefficients.
-        times: moments of the training frames, ascending.
-        poses: their axis-angle rotations, radians.
-        translations: their translations, metres.
-        scene_scale: what the authors' release multiplies lengths with (3 / (1.1 times the furthest camera)).
+        step: of the training stage, from 0; None in evaluation.
+        epoch: how often the stage has seen all training frames.
+        starts_epoch: whether this is the epoch's first step.
     """
 
-    body: Body
-    betas: Float[Tensor, "S"]
-    times: Int[Tensor, "T"]
-    poses: Float[Tensor, "T 24 3"]
-    translations: Float[Tensor, "T 3"]
-    scene_scale: float
+    step: int | None = None
+    epoch: int = 0
+    starts_epoch: bool = False
 
-    @staticmethod
-    def of(capture: Capture) -> "Subject":
-        """The subject of a capture's training frames."""
-        moments = {frame.time: frame for frame in capture.train}
-        frames = [moments[time] for time in sorted(moments)]
-        middle = torch.stack([f.translation + capture.body.joints[0] for f in frames]).mean(0)
-        away = max(float((f.camera.center - middle).norm()) for f in frames)
-        return Subject(
-            body=capture.body,
-            betas=capture.betas,
-            times=torch.tensor([f.time for f in frames]),
-            poses=torch.stack([f.pose for f in frames]),
-            translations=torch.stack([f.translation for f in frames]),
-            scene_scale=3 / (1.1 * away),
-        )
+    @property
+    def training(self) -> bool:
+        """Whether this is training."""
+        return self.step is not None
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """As a run folder stores it."""
-        own = {"betas": self.betas, "times": self.times, "poses": self.poses, "translations": self.translations}
-        body = {f"body_{name}": array for name, array in self.body.arrays().items()}
-        return {**{name: t.numpy() for name, t in own.items()}, **body, "scene_scale": np.array(self.scene_scale)}
 
-    @staticmethod
-    def from_arrays(arrays: dict[str, np.ndarray], where: str) -> "Subject":
-        """What `arrays` gave, read back.
+EVALUATION = Mode()
+"""No training step."""
 
-        Raises:
-            TwofoldError: something is missing, has the wrong shape or is not finite.
-        """
-        shapes = {"betas": ("S",), "times": ("T",), "poses": ("T", 24, 3), "translations": ("T", 3), "scene_scale": ()}
-        missing = [name for name in shapes if name not in arrays]
-        if missing:
-            raise TwofoldError(f"{where} lacks {', '.join(missing)}; it is damaged, train again.")
-        body = Body.from_arrays({n[5:]: a for n, a in arrays.items() if n.startswith("body_")}, where)
-        sizes: dict[str | int, int] = {"S": arrays["betas"].size, "T": arrays["times"].size}
-        for name, shape in shapes.items():
-            array, expected = arrays[name], tuple(sizes.get(axis, axis) for axis in shape)
-            if array.shape != expected or array.dtype.kind not in "fiu" or not are_moderate(array):
-                raise TwofoldError(
-                    f"{name} in {where} should be finite numbers of shape {expected}, it is {array.dtype} of "
-                    f"{array.shape}; it is damaged, train again."
-                )
-        return Subject(
-            body=body,
-            betas=torch.as_tensor(arrays["betas"]).float(),
-            times=torch.as_tensor(arrays["times"]).long(),
-            poses=torch.as_tensor(arrays["poses"]).float(),
-            translations=torch.as_tensor(arrays["translations"]).float(),
-            scene_scale=float(arrays["scene_scale"]),
-        )
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a training with an optimizer and settings of its own.
+
+    Attributes:
+        name: for progress and curves.
+        training: its settings.
+    """
+
+    name: str
+    training: TrainingConfig
+
+
+@dataclass(frozen=True)
+class ParameterGroup:
+    """Trainable parameters that share a learning rate.
+
+    Attributes:
+        name: for messages.
+        rate: learning rate before schedules.
+        parameters: may be empty.
+    """
+
+    name: str
+    rate: float
+    parameters: list[nn.Parameter]
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Rays of one picture with what was seen along them.
+    """Rays of one image with what was observed along them.
 
     Attributes:
         rays: single pixels first, then patches row by row.
-        color: what the picture shows, on the capture's background, 0..1.
+        image: the image's own colour, background included, 0..1.
         mask: share of the pixel that the person covers.
         singles: how many of the rays are single pixels.
         patch_pixels: for each pixel of each patch, its ray, or -1 outside the body's box and where pixels are ignored.
-        patch_color: what the picture shows there, pixels without a ray included; the background where pixels are
-            ignored and beyond the picture.
-        background: colour outside the mask, 0..1.
+        patch_image: what the image shows there, pixels without a ray included.
+        patch_mask: share of these pixels that the person covers; 0 where pixels are ignored and beyond the image.
+        frame_index: which frame of the motion the image shows.
+        background: the colour that `color` is composited on, one for all rays or one a ray; None leaves the image's.
     """
 
     rays: Rays
-    color: Float[Tensor, "R 3"]
+    image: Float[Tensor, "R 3"]
     mask: Float[Tensor, "R"]
     singles: int
     patch_pixels: Int[Tensor, "patches P P"]
-    patch_color: Float[Tensor, "patches P P 3"]
-    background: Float[Tensor, "3"]
+    patch_image: Float[Tensor, "patches P P 3"]
+    patch_mask: Float[Tensor, "patches P P"]
+    frame_index: int
+    background: Float[Tensor, "*r 3"] | None = None
+
+    @property
+    def color(self) -> Float[Tensor, "R 3"]:
+        """What a rendering is compared with: the person on the batch's background, 0..1."""
+        if self.background is None:
+            return self.image
+        return self.image * self.mask[:, None] + self.background * (1 - self.mask[:, None])
+
+    def against(self, background: Float[Tensor, "*r 3"] | None) -> "Batch":
+        """The same batch on another background."""
+        return replace(self, background=background)
+
+    @property
+    def patch_color(self) -> Float[Tensor, "patches P P 3"]:
+        """What the patches show, on the batch's background (one colour), 0..1."""
+        if self.background is None:
+            return self.patch_image
+        mask = self.patch_mask[..., None]
+        return self.patch_image * mask + self.background * (1 - mask)
 
     def patches(
         self, color: Float[Tensor, "R 3"], fill: Float[Tensor, "3"] | None = None
     ) -> Float[Tensor, "patches 3 P P"]:
-        """The patches as pictures, from colours along the rays; pixels without one have the colour `fill` or black."""
+        """The patches as images, from colours along the rays; pixels without a ray have the colour `fill` or black."""
         none = torch.zeros_like(color[0]) if fill is None else fill
         return torch.cat([color, none[None]])[self.patch_pixels].permute(0, 3, 1, 2)
 
 
 @dataclass(frozen=True)
-class PosedAvatar:
-    """A body in a pose with what rendering derives from it once.
+class PosedAvatar(Generic[Own]):
+    """An avatar's body in a pose, with what its method derives from the pose once.
 
     Attributes:
         body: the posed body.
-        forward: canonical-to-posed transform at each vertex.
-        condition: what the pose-dependent branch is told.
-        shell: where to sample.
-        box: two corners around the joints, where rays without a shell begin and end, metres.
-        neighbours: how many nearest vertices give a point its skinning weights.
-        anchors: canonical vertices that turn normals, where these are not the ones that inverse skinning found.
+        own: private to the method.
     """
 
     body: PosedBody
-    forward: Float[Tensor, "V 3 4"]
-    condition: Float[Tensor, "P"]
-    shell: Shell
-    box: Float[Tensor, "2 3"]
-    neighbours: int = 1
-    anchors: Float[Tensor, "V 3"] | None = None
+    own: Own
 
 
 @dataclass(frozen=True)
 class Rendering:
     """Pixels: colour on the background, opacity, expected depth (metres), normal in observation space (length <= 1).
 
-    `base` is the rendering by the pose-independent branch alone, where a method has one and it was asked for.
+    Attributes:
+        color: 0..1, not clamped.
+        opacity: 0..1.
+        depth: metres along the ray.
+        normal: in observation space; zero where a method has none.
+        base: the rendering by the pose-independent branch alone, where a method has one.
+        extras: by name what only the method's own losses use.
     """
 
     color: Float[Tensor, "R 3"]
@@ -156,6 +160,7 @@ class Rendering:
     depth: Float[Tensor, "R"]
     normal: Float[Tensor, "R 3"]
     base: "Rendering | None" = None
+    extras: dict[str, Tensor] = field(default_factory=dict)
 
 
 class MethodConfig(ABC):
@@ -166,41 +171,66 @@ class MethodConfig(ABC):
         """An untrained avatar of a subject."""
 
 
-class Avatar(nn.Module, ABC):
-    """A person that can be posed and looked at. Everything above methods uses only what stands here."""
+class Avatar(nn.Module, ABC, Generic[Own]):
+    """A person that can be posed and rendered. Everything above methods uses only what stands here."""
+
+    subject: Subject
+
+    @property
+    def device(self) -> torch.device:
+        """Where its parameters are."""
+        return next(self.parameters()).device
+
+    # ---- posing and rendering
 
     @abstractmethod
     def pose(
         self,
         pose: Float[Tensor, "24 3"],
         translation: Float[Tensor, "3"],
-        time: int | None = None,
-        step: int | None = None,
-    ) -> PosedAvatar:
+        frame_index: int | None = None,
+        mode: Mode = EVALUATION,
+    ) -> PosedAvatar[Own]:
         """The avatar in a pose.
 
         Args:
             pose: axis-angle, root first, radians.
             translation: SMPL's own, metres.
-            time: a training moment whose learned pose correction is to be applied; None applies none.
-            step: the training step, for schedules; None when not training.
+            frame_index: a training frame whose learned corrections and codes are to be applied; None applies none.
+            mode: training or evaluation.
         """
 
     @abstractmethod
     def render(
-        self, rays: Rays, posed: PosedAvatar, background: Float[Tensor, "3"], generator: torch.Generator | None = None
+        self,
+        rays: Rays,
+        posed: PosedAvatar[Own],
+        background: Float[Tensor, "*r 3"] | None,
+        mode: Mode = EVALUATION,
+        generator: torch.Generator | None = None,
     ) -> Rendering:
-        """What is seen along rays. With a generator, samples are placed at random (training); without, evenly."""
+        """What is seen along rays.
+
+        Args:
+            rays: near and far bounds are respected where the method has no bounds of its own.
+            posed: the avatar in a pose.
+            background: colour behind the person, one for all rays or one a ray; None asks for the method's own
+                background, in training only.
+            mode: training or evaluation.
+            generator: moves samples at random; None spaces them evenly.
+        """
 
     @abstractmethod
-    def losses(
-        self, rendering: Rendering, batch: Batch, posed: PosedAvatar, step: int, generator: torch.Generator
-    ) -> dict[str, Float[Tensor, ""]]:
-        """Named loss terms, already weighted; the loop adds them."""
+    def level(self, x: Float[Tensor, "S 3"], posed: PosedAvatar[Own], branch: str = "full") -> Float[Tensor, "S"]:
+        """Zero on the surface, negative inside, about metres near it; of the full field or its base branch.
 
-    @abstractmethod
-    def level(self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full") -> Float[Tensor, "S"]:
-        """Zero on the surface in canonical space, negative inside; of the "full" field or its "base" branch."""
+        The points lie in the space that `level_space` names.
+        """
+
+    @property
+    def level_space(self) -> Literal["canonical", "posed"]:
+        """The space of `level`: canonical, or the posed space of a method whose density is not a canonical one."""
+        return "canonical"
 
     @property
     def reach(self) -> float:
@@ -245,17 +275,81 @@ class Avatar(nn.Module, ABC):
         """
         raise TwofoldError(f"{type(self).__name__} does not map points to canonical space; render it instead.")
 
+    # ---- training
+
+    def stages(self, training: TrainingConfig) -> tuple[Stage, ...]:
+        """The stages of a training, one after the other; most methods have one."""
+        return (Stage("train", training),)
+
+    def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
+        """Called once before a stage's first step: pre-fits, key frames. What it makes is part of the state.
+
+        Raises:
+            TwofoldError: the capture lacks what the method needs.
+        """
+
+    def load_stored(self, state: dict[str, Tensor]) -> None:
+        """Called with a stored state before it is loaded, to take on sizes and the stage that it was stored in."""
+
+    def background(
+        self, color: Float[Tensor, "3"], rays: int, generator: torch.Generator
+    ) -> Float[Tensor, "*r 3"] | None:
+        """What images are composited on in a training step: the capture's colour unless a method wants another.
+
+        None trains on the images' own background, which the method then renders itself.
+        """
+        return color
+
     @abstractmethod
-    def before_step(self, step: int) -> None:
+    def losses(
+        self, rendering: Rendering, batch: Batch, posed: PosedAvatar[Own], mode: Mode, generator: torch.Generator
+    ) -> dict[str, Float[Tensor, ""]]:
+        """Named loss terms, already weighted; the loop adds them."""
+
+    def before_step(self, mode: Mode) -> None:
         """Called before each training step."""
 
-    def count_epochs(self, steps: int | float) -> None:
-        """Called before the first step with the length of an epoch, for methods whose schedules count them."""
+    def after_step(self, mode: Mode, capture: Capture) -> Literal["continue", "restart"]:
+        """Called after each training step; "restart" starts the training again from other initial weights."""
+        return "continue"
+
+    @abstractmethod
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """Trainable parameters of the current stage with their learning rates."""
+
+    @property
+    def ray_margin(self) -> float:
+        """How far from the body's vertices rays of training pixels may pass, metres."""
+        return 0.32
+
+    def scalars(self) -> dict[str, float]:
+        """Values for the training curves, by name."""
+        return {}
+
+    @property
+    def wants_perceptual(self) -> bool:
+        """Whether a perceptual network is part of the loss."""
+        return False
+
+    def attach_perceptual(self, network: LPIPS | None) -> None:
+        """Takes the network of the perceptual loss, which is neither trained nor stored; None leaves the term out."""
 
     def compiled(self) -> AbstractContextManager[bool]:
         """While the block lasts, what a compiler can make faster runs compiled; tells whether there is anything."""
         return nullcontext(False)
 
-    @abstractmethod
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Trainable parameters by name of their learning rate."""
+    # ---- refined poses
+
+    def refined_pose(
+        self, frame_index: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], max_gap: float
+    ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
+        """A frame's pose with what training learned about the errors of the capture's poses.
+
+        A training frame has a correction of its own. Another frame between two of these takes theirs, interpolated, if
+        they are no more than `max_gap` frames apart. All others stay as given, as they do without pose refinement.
+        """
+        return pose, translation
+
+    def pose_corrections(self) -> dict[str, float]:
+        """Root-mean-square size of the learned corrections, radians and metres; empty without pose refinement."""
+        return {}

@@ -1,6 +1,7 @@
 """The paper's method: an avatar whose field has a pose-independent and a pose-dependent branch."""
 
 import dataclasses
+import functools
 import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -14,35 +15,34 @@ from torch.nn import functional as F
 from twofold.body.skeleton import PosedBody, ShapedBody, pose_body, shape_body
 from twofold.config import require, require_within
 from twofold.deform.pose_refinement import PoseRefinement
-from twofold.deform.skinning import (
-    normal_matrices,
-    to_canonical,
-    vertex_transforms,
-    weights_by,
-)
-from twofold.field.factorized import FactorizedField, FactorizedFieldConfig
-from twofold.field.factorized_grid import GridField, GridFieldConfig
+from twofold.deform.skinning import normal_matrices, to_canonical, vertex_transforms, weights_by
+from twofold.field.factorized import FactorizedFieldConfig
+from twofold.field.factorized_grid import GridFieldConfig
 from twofold.field.output import FieldOutput
-from twofold.geometry.cameras import Rays, without_tiny_components
+from twofold.geometry.cameras import Rays
 from twofold.geometry.surfaces import nearest_vertices
 from twofold.kernels.runtime import compiled_methods
 from twofold.losses import MOST_STEPS, LossConfig
-from twofold.methods.base import Avatar, Batch, MethodConfig, PosedAvatar, Rendering, Subject
-from twofold.methods.loss_terms import loss_terms
-from twofold.methods.placing import (
-    Distance,
-    Placed,
-    ShellSampler,
-    joint_box,
-    place_error_bounded,
-    place_in_shell,
-    that_count,
+from twofold.methods.base import (
+    EVALUATION,
+    Avatar,
+    Batch,
+    MethodConfig,
+    Mode,
+    ParameterGroup,
+    PosedAvatar,
+    Rendering,
 )
+from twofold.methods.factorized_config import RateConfig
+from twofold.methods.loss_terms import loss_terms
 from twofold.methods.pose_schedule import PoseConfig, condition
+from twofold.methods.subject import Subject
 from twofold.metrics.perceptual import LPIPS
 from twofold.sampling.error_bounded import ErrorBoundedSampler
-from twofold.sampling.sdf_grid import DistanceTable, tabulate
-from twofold.sampling.shell import Shell, build_shell
+from twofold.sampling.placement import Deformation, FieldQuery, Placement, Sampler
+from twofold.sampling.posed_surface import PosedSurface
+from twofold.sampling.shell import Shell
+from twofold.sampling.shell_sampler import ShellSampler
 from twofold.volume.rendering import composite, composite_weights, laplace_density
 from twofold.volume.samples import Samples
 
@@ -55,6 +55,7 @@ class FactorizedConfig(MethodConfig):
     sampler: ErrorBoundedSampler | ShellSampler = dataclasses.field(default_factory=ShellSampler)
     losses: LossConfig = dataclasses.field(default_factory=LossConfig)
     pose: PoseConfig = dataclasses.field(default_factory=PoseConfig)
+    rates: RateConfig = dataclasses.field(default_factory=RateConfig)
     neighbours: int = 1
     """How many nearest vertices give a point its skinning weights."""
     late_neighbours: int | None = None
@@ -80,18 +81,15 @@ class FactorizedConfig(MethodConfig):
     """"released" measures lengths along rays and outliers in the release's normalised scene units."""
     shell_refresh: int = 500
     """Steps after which the shells follow the corrected poses."""
+    background: Literal["capture", "random"] = "capture"
+    """What training images are composited on: the capture's background, or a random colour at each step."""
 
     def __post_init__(self) -> None:
         """Refuses options that exclude each other."""
         require_within(
-            self,
-            neighbours=(1, 64),
-            late_neighbours=(1, 64),
-            late_from=(1, MOST_STEPS),
-            shell_refresh=(1, MOST_STEPS),
-            outlier_distance=(0.001, 10),
-            beta=(0, 10),
-        )
+            self, neighbours=(1, 64), late_neighbours=(1, 64), late_from=(1, MOST_STEPS),
+            shell_refresh=(1, MOST_STEPS), outlier_distance=(0.001, 10), beta=(0, 10),
+        )  # fmt: skip
         require(0 < self.beta_floor < self.beta, f"beta_floor should lie between 0 and beta={self.beta}")
         if isinstance(self.field, GridFieldConfig) and isinstance(self.sampler, ShellSampler):
             within = self.sampler.radius <= self.field.radius
@@ -102,7 +100,25 @@ class FactorizedConfig(MethodConfig):
         return FactorizedAvatar(self, subject, seed)
 
 
-class FactorizedAvatar(Avatar):
+@dataclass(frozen=True)
+class FactorizedPose:
+    """What the method derives from a pose.
+
+    Attributes:
+        surface: the posed body with its shell.
+        condition: the pose vector that the pose-dependent branch is conditioned on.
+        anchors: canonical vertices that turn normals, where these are not the ones that inverse skinning found.
+    """
+
+    surface: PosedSurface
+    condition: Float[Tensor, "P"]
+    anchors: Float[Tensor, "V 3"] | None = None
+
+
+Posed = PosedAvatar[FactorizedPose]
+
+
+class FactorizedAvatar(Avatar[FactorizedPose]):
     """See `FactorizedConfig`."""
 
     shell_poses: Tensor
@@ -122,10 +138,7 @@ class FactorizedAvatar(Avatar):
         canonical = pose_body(given, subject.poses[0], subject.translations[0])
         self.register_buffer("rest_joints", given.joints.clone(), persistent=False)
         pose_size = 72 if config.pose.with_root else 69
-        if isinstance(config.field, GridFieldConfig):
-            self.field = config.field.build(canonical, pose_size, generator)
-        else:
-            self.field = config.field.build(pose_size, generator)
+        self.field = config.field.build(canonical, pose_size, generator)
         start = config.beta - config.beta_floor
         # Softplus with this sharpness is nearly linear at the start, yet never reaches zero.
         raw = start if config.beta_form == "absolute" else math.log(math.expm1(start / _BETA_UNIT)) * _BETA_UNIT
@@ -138,22 +151,30 @@ class FactorizedAvatar(Avatar):
         self.register_buffer("canonical_points", canonical.canonical_vertices.clone(), persistent=False)
         if config.late_neighbours is not None:
             self.register_buffer("late_shape", torch.zeros_like(subject.betas))
-        self.epoch_steps: int | float = len(subject.times)
-        self.box_given = isinstance(config.sampler, ErrorBoundedSampler) and config.sampler.box == "given"
         self._shells: dict[int, Shell] = {}
         self._bodies = {torch.device("cpu"): subject.body}
         self._perceptual: tuple[LPIPS, ...] = ()
-        self._home: Shell | None = None
-        self._last_table: tuple[PosedAvatar, tuple[int, ...], DistanceTable] | None = None
+        weigh = functools.partial(weights_by, config.falloff, scale=self.scale)
+        self.deformation = Deformation(weigh, config.outlier_distance / self.scale, self.scale)
+        self._sampler: Sampler = config.sampler.build(self.deformation, canonical.canonical_vertices, canonical.faces)
 
-    def attach_lpips(self, network: LPIPS | None) -> None:
-        """Gives it the network behind the perceptual term, which is neither trained, nor stored, nor moved with it."""
+    @property
+    def wants_perceptual(self) -> bool:
+        """See `Avatar.wants_perceptual`."""
+        return self.config.losses.lpips > 0
+
+    def attach_perceptual(self, network: LPIPS | None) -> None:
+        """See `Avatar.attach_perceptual`; it is not moved with the avatar either."""
         self._perceptual = (network.to(self.device),) if network else ()
 
     @property
-    def device(self) -> torch.device:
-        """Where its parameters are."""
-        return self.raw_beta.device
+    def ray_margin(self) -> float:
+        """See `Avatar.ray_margin`."""
+        return self.config.sampler.reach + 0.02
+
+    def scalars(self) -> dict[str, float]:
+        """See `Avatar.scalars`: the scale of the density."""
+        return {"beta": float(self.beta.detach())}
 
     @property
     def beta(self) -> Float[Tensor, ""]:
@@ -164,25 +185,28 @@ class FactorizedAvatar(Avatar):
 
     def compiled(self) -> AbstractContextManager[bool]:
         """See `Avatar.compiled`. Feature grids have compiled loops of their own."""
-        dense = ("forward", "sdf", "distance_and_gradient") if isinstance(self.field, FactorizedField) else ()
-        return compiled_methods(self.field, dense)
+        return compiled_methods(self.field, ("forward", "sdf", "distance_and_gradient") if self.field.dense else ())
 
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+    def parameter_groups(self) -> list[ParameterGroup]:
         """The field's groups, "beta" and "pose"."""
         pose = [p for p in self.refinement.parameters() if p.requires_grad]
-        return {**self.field.parameter_groups(), "beta": [self.raw_beta], "pose": pose}
+        groups = {**self.field.parameter_groups(), "beta": [self.raw_beta], "pose": pose}
+        return [ParameterGroup(name, getattr(self.config.rates, name), group) for name, group in groups.items()]
 
-    def count_epochs(self, steps: int | float) -> None:
-        """See `Avatar.count_epochs`."""
-        if self.config.pose.epochs == "training":
-            self.epoch_steps = steps
+    def background(
+        self, color: Float[Tensor, "3"], rays: int, generator: torch.Generator
+    ) -> Float[Tensor, "*r 3"] | None:
+        """See `Avatar.background`."""
+        if self.config.background == "capture":
+            return color
+        return torch.rand(3, generator=generator, device=generator.device).to(color)
 
-    def before_step(self, step: int) -> None:
+    def before_step(self, mode: Mode) -> None:
         """Lets the shells, and the canonical body that turns normals, follow the corrections from time to time."""
-        passed = [self._epoch(at) // self.config.late_from for at in (max(step - 1, 0), step)]
-        if self.config.late_neighbours is not None and passed[1] > passed[0]:
+        epoch, first = self._epoch(mode)
+        if self.config.late_neighbours is not None and first and epoch and epoch % self.config.late_from == 0:
             self.late_shape.copy_(self.refinement.shape.detach())
-        refresh = self.config.shell_refresh
+        refresh, step = self.config.shell_refresh, mode.step or 0
         if not self.refinement.parts or step == 0 or step % refresh or step < self.config.pose.refine_from:
             return
         with torch.no_grad():
@@ -194,31 +218,33 @@ class FactorizedAvatar(Avatar):
         self._shells.clear()
 
     def pose(
-        self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], time: int | None = None,
-        step: int | None = None,
-    ) -> PosedAvatar:  # fmt: skip
-        """See `Avatar.pose`. While training, a moment's shell is reused until the next refresh."""
-        data = pose, translation = pose.to(self.device), translation.to(self.device)
-        config = self.config
-        training = step is not None
-        refining = training and step >= config.pose.refine_from
-        if time is not None:
+        self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], frame_index: int | None = None,
+        mode: Mode = EVALUATION,
+    ) -> Posed:  # fmt: skip
+        """See `Avatar.pose`. While training, a frame's shell is reused until the next refresh."""
+        pose, translation = pose.to(self.device), translation.to(self.device)
+        config, data = self.config, (pose, translation)
+        refining = mode.step is not None and mode.step >= config.pose.refine_from
+        if frame_index is not None:
             with torch.set_grad_enabled(torch.is_grad_enabled() and refining):
-                pose, translation = self.refinement(time, pose, translation)
+                pose, translation = self.refinement(frame_index, pose, translation)
         with torch.set_grad_enabled(torch.is_grad_enabled() and refining and bool(self.refinement.parts)):
-            refined = training or time is not None or config.pose.test_shape == "refined"
+            refined = mode.training or frame_index is not None or config.pose.test_shape == "refined"
             shaped = self._shape(self.refinement.shape if refined else None)
             rest_joints = self.rest_joints if config.pose.canonical_shape == "given" else None
             body = pose_body(shaped, pose, translation, rest_joints)
-        box = joint_box(body.joints)
-        if self.box_given:
-            box = joint_box(pose_body(self._shape(None), *data).joints, self.subject.scene_scale)
-        neighbours = config.neighbours
-        if step is not None and config.late_neighbours is not None and self._epoch(step) >= config.late_from:
-            neighbours = config.late_neighbours
-        seen = condition(config.pose, pose, step, self._epoch(step or 0))
-        shell, anchors = self._shell(body, time, training), self._anchors(training)
-        return PosedAvatar(body, vertex_transforms(body), seen, shell, box, neighbours, anchors)
+            forward = vertex_transforms(body)
+
+        def given() -> Tensor:
+            return pose_body(self._shape(None), *data).joints
+
+        box = config.sampler.ray_box(body.joints, given, self.subject.scene_scale)
+        epoch, _ = self._epoch(mode)
+        late = mode.training and config.late_neighbours is not None and epoch >= config.late_from
+        neighbours = (config.late_neighbours if late else None) or config.neighbours
+        seen = condition(config.pose, pose, mode.step, epoch)
+        surface = PosedSurface(body, forward, self._shell(body, frame_index, mode), box, neighbours)
+        return PosedAvatar(body, FactorizedPose(surface, seen, self._anchors(mode)))
 
     def _shape(self, change: Tensor | None) -> ShapedBody:
         """The body, its shape corrected by so much or as it was given."""
@@ -229,60 +255,75 @@ class FactorizedAvatar(Avatar):
         betas = self.subject.betas.to(self.device)
         return shape_body(self._bodies[self.device], betas if change is None else betas + change)
 
-    def _epoch(self, step: int) -> int:
-        return int(step // self.epoch_steps)
+    def _epoch(self, mode: Mode) -> tuple[int, bool]:
+        """The epoch of a training step, and whether it begins there, as `PoseConfig.epochs` counts them."""
+        if self.config.pose.epochs == "training":
+            return mode.epoch, mode.starts_epoch
+        epoch, within = divmod(mode.step or 0, len(self.subject.times))
+        return epoch, within == 0
 
-    def _anchors(self, training: bool) -> Tensor | None:
-        """Canonical vertices that turn normals, or None where those do that carried the sample home."""
+    def _anchors(self, mode: Mode) -> Tensor | None:
+        """Canonical vertices that turn normals, or None where those do that mapped the sample."""
         if self.config.normals_by == "posed":
             return None
-        if not training or self.config.late_neighbours is None or not self.late_shape.any():
+        if not mode.training or self.config.late_neighbours is None or not self.late_shape.any():
             return self.canonical_points
         rest = torch.zeros(24, 3, device=self.device)
         return pose_body(self._shape(self.late_shape), rest, rest[0]).canonical_vertices
 
-    def _carried(self, x_posed: Tensor, nearest: Tensor, shares: Tensor, posed: PosedAvatar) -> tuple[Tensor, Tensor]:
-        """Points in canonical space, and what turns their gradients into observation space."""
-        x_canonical, turn = to_canonical(x_posed, nearest, shares, posed.forward)
-        if posed.anchors is not None:
-            away, nearest = nearest_vertices(x_canonical, posed.anchors, posed.neighbours)
-            # Canonical space is in metres, in the release too.
-            turn = normal_matrices(nearest, weights_by(self.config.falloff, away.square()), posed.forward)
-        return x_canonical, turn
+    def _normal_matrices(self, x_canonical: Tensor, by_posed: Tensor, posed: Posed) -> Tensor:
+        """What turns canonical gradients into observation space: that of the mapping, or of the nearest anchors."""
+        own = posed.own
+        if own.anchors is None:
+            return by_posed
+        away, nearest = nearest_vertices(x_canonical, own.anchors, own.surface.neighbours)
+        # Canonical space is in metres, in the release too.
+        return normal_matrices(nearest, weights_by(self.config.falloff, away.square()), own.surface.forward)
 
-    def _shell(self, body: PosedBody, time: int | None, training: bool) -> Shell:
-        sampler = self.config.sampler
-        radius, voxel = (sampler.radius, sampler.voxel) if isinstance(sampler, ShellSampler) else (0.1, 0.03)
-        listed = max(6, 2 * max(self.config.neighbours, self.config.late_neighbours or 1))
-        row = self.refinement.rows.get(time) if training and time is not None else None
+    def _shell(self, body: PosedBody, frame_index: int | None, mode: Mode) -> Shell:
+        sampler, neighbours = self.config.sampler, max(self.config.neighbours, self.config.late_neighbours or 1)
+        row = self.refinement.rows.get(frame_index) if mode.training and frame_index is not None else None
         if row is None:
-            return build_shell(body.vertices, body.faces, radius, voxel, listed)
+            return sampler.shell(body.vertices, body.faces, neighbours)
         if row not in self._shells:
             with torch.no_grad():
                 shaped = self._shape(self.shell_shape)
                 start = pose_body(shaped, self.shell_poses[row], self.shell_translations[row])
-            self._shells[row] = build_shell(start.vertices, body.faces, radius, voxel, listed)
+            self._shells[row] = sampler.shell(start.vertices, body.faces, neighbours)
         return self._shells[row]
 
     def render(
-        self, rays: Rays, posed: PosedAvatar, background: Float[Tensor, "3"], generator: torch.Generator | None = None
-    ) -> Rendering:
+        self, rays: Rays, posed: Posed, background: Float[Tensor, "*r 3"] | None, mode: Mode = EVALUATION,
+        generator: torch.Generator | None = None,
+    ) -> Rendering:  # fmt: skip
         """See `Avatar.render`."""
-        rays = without_tiny_components(rays) if self.box_given else rays
-        placed = self._place(rays, posed, generator)
+        behind = torch.zeros(3, device=self.device) if background is None else background
+        placed = self.place(rays, posed, mode, generator)
+        if len(placed.samples) == 0:
+            return self._nothing(len(rays), behind)
         samples, outlier = placed.samples, placed.outlier
-        if len(samples) == 0:
-            return self._nothing(len(rays), background)
-        x_canonical, to_observation = self._carried(samples.points(rays), placed.nearest, placed.shares, posed)
-        answer = self.field(x_canonical, posed.condition, to_observation)
+        x_canonical, by_posed = placed.differentiable(posed.own.surface)
+        to_observation = self._normal_matrices(x_canonical, by_posed, posed)
+        answer = self.field(x_canonical, posed.own.condition, to_observation)
         normals = F.normalize((to_observation * answer.gradient[:, None]).sum(-1), dim=-1, eps=1e-6)
-        whole = self._composite(answer, normals, samples, outlier, background, len(rays))
+        whole = self._composite(answer, normals, samples, outlier, behind, len(rays))
         if answer.base is None:
             return whole
-        # The base picture's normals are its own branch's, at the same samples.
+        # The base rendering's normals are its own branch's, at the same samples.
         base_normals = F.normalize((to_observation * answer.base.gradient[:, None]).sum(-1), dim=-1, eps=1e-6)
-        base = self._composite(answer.base, base_normals, samples, outlier, background, len(rays))
-        return Rendering(whole.color, whole.opacity, whole.depth, whole.normal, base)
+        return replace(whole, base=self._composite(answer.base, base_normals, samples, outlier, behind, len(rays)))
+
+    def place(self, rays: Rays, posed: Posed, mode: Mode, generator: torch.Generator | None) -> Placement:
+        """The samples that `render` shades."""
+
+        def distance(x_canonical: Tensor) -> Tensor:
+            return self.field.sdf(x_canonical, posed.own.condition)
+
+        version = tuple(parameter._version for parameter in self.field.parameters())
+        query = FieldQuery(distance, self.beta, self.field.dense, version)
+        placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
+        shading = self.config.outliers_in_shading and not mode.training
+        return placed if shading else replace(placed, outlier=torch.zeros_like(placed.outlier))
 
     def _composite(
         self, answer: FieldOutput, normals: Tensor, samples: Samples, outlier: Tensor, background: Tensor, rays: int
@@ -304,97 +345,65 @@ class FactorizedAvatar(Avatar):
         two = self.config.field.branches in ("both", "high_rendered")
         return replace(empty, base=empty if two else None)
 
-    def _place(self, rays: Rays, posed: PosedAvatar, generator: torch.Generator | None) -> Placed:
-        sampler, k = self.config.sampler, posed.neighbours
-        limit = self.config.outlier_distance / self.scale
-
-        def distance(x_canonical: Tensor) -> Tensor:
-            return self.field.sdf(x_canonical, posed.condition)
-
-        if isinstance(sampler, ErrorBoundedSampler):
-            scale = self.scale if sampler.units == "scene" else 1.0
-            placed = place_error_bounded(
-                sampler, rays, posed, self._weigh, limit, generator, distance, self.beta, scale
-            )
-            shading = self.config.outliers_in_shading and generator is None
-            return replace(placed, outlier=placed.outlier & shading)
-        placed = place_in_shell(sampler, rays, posed, k, self._weigh, min(sampler.radius, limit), generator)
-        home = self._canonical_shell(sampler, posed) if sampler.stray > 0 else None
-        table = None if self.training or generator is not None else lambda count: self._table(count, posed, distance)
-        return that_count(sampler, placed, rays, posed, home, distance, self.beta, table)
-
-    def _weigh(self, squared_distances: Float[Tensor, "S K"]) -> Float[Tensor, "S K"]:
-        return weights_by(self.config.falloff, squared_distances, self.scale)
-
-    def _canonical_shell(self, sampler: ShellSampler, posed: PosedAvatar) -> Shell:
-        if self._home is None or self._home.vertices.device != self.device:
-            self._home = build_shell(self.canonical_points, posed.body.faces, sampler.radius, sampler.voxel)
-        return self._home
-
-    def _table(self, samples: int, posed: PosedAvatar, distance: Distance) -> DistanceTable | None:
-        """The distance table of this pose, made as soon as it pays; the last one is kept."""
-        sampler = self.config.sampler
-        if not isinstance(sampler, ShellSampler) or sampler.table_voxel == 0 or isinstance(self.field, GridField):
-            return None
-        state = tuple(parameter._version for parameter in self.field.parameters())
-        last = self._last_table
-        if last is not None and last[0] is posed and last[1] == state:
-            return last[2]
-        if samples < _TABLE_PAYS * (0.015 / sampler.table_voxel) ** 3:
-            return None
-        table = tabulate(distance, self.canonical_points, sampler.table_voxel, sampler.radius)
-        self._last_table = (posed, state, table)
-        return table
-
     def losses(
-        self, rendering: Rendering, batch: Batch, posed: PosedAvatar, step: int, generator: torch.Generator
+        self, rendering: Rendering, batch: Batch, posed: Posed, mode: Mode, generator: torch.Generator
     ) -> dict[str, Float[Tensor, ""]]:
         """See `Avatar.losses`."""
 
         def gradients(x_canonical: Tensor) -> Tensor:
-            return self.field.distance_and_gradient(x_canonical, posed.condition)[1]
+            return self.field.distance_and_gradient(x_canonical, posed.own.condition)[1]
 
         network = self._perceptual[0] if self._perceptual else None
-        vertices = self.canonical_points
-        return loss_terms(self.config.losses, rendering, batch, vertices, gradients, network, step, generator)
+        config, vertices = self.config.losses, self.canonical_points
+        return loss_terms(config, rendering, batch, vertices, gradients, network, mode.step or 0, generator)
 
-    def level(self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar, branch: str = "full") -> Float[Tensor, "S"]:
+    def level(self, x: Float[Tensor, "S 3"], posed: Posed, branch: str = "full") -> Float[Tensor, "S"]:
         """See `Avatar.level`."""
+        require(branch in ("full", "base"), f'branch is "full" or "base"; it is {branch!r}')
         if branch == "full":
-            return self.field.sdf(x_canonical, posed.condition)
-        return self.query(x_canonical, posed, branch=branch).sdf
+            return self.field.sdf(x, posed.own.condition)
+        return self.query(x, posed, branch=branch).sdf
 
-    @property
-    def reach(self) -> float:
-        """See `Avatar.reach`."""
-        sampler, limit = self.config.sampler, self.config.outlier_distance / self.scale
-        return min(sampler.radius, limit) if isinstance(sampler, ShellSampler) else limit
+    def refined_pose(
+        self, frame_index: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], max_gap: float
+    ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
+        """See `Avatar.refined_pose`."""
+        with torch.no_grad():
+            return self.refinement.at(
+                frame_index, pose.to(self.device), translation.to(self.device), self.subject, max_gap
+            )
+
+    def pose_corrections(self) -> dict[str, float]:
+        """See `Avatar.pose_corrections`."""
+        return self.refinement.change() if self.refinement.parts else {}
 
     @property
     def separates_light(self) -> bool:
         """See `Avatar.separates_light`."""
-        return isinstance(self.field, GridField)
+        return self.field.separates_light
 
     def query(
-        self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar,
+        self, x_canonical: Float[Tensor, "S 3"], posed: Posed,
         to_observation: Float[Tensor, "S 3 3"] | None = None, branch: str = "full", lit: bool = True,
     ) -> FieldOutput:  # fmt: skip
         """See `Avatar.query`."""
         require(branch in ("full", "base"), f'branch is "full" or "base"; it is {branch!r}')
-        plain = self.field.unlit if isinstance(self.field, GridField) and not lit else None
-        x, pose = x_canonical, posed.condition
-        answer = plain(x, pose) if plain else self.field(x, pose, to_observation)
+        if self.field.separates_light and not lit:
+            answer = self.field.unlit(x_canonical, posed.own.condition)
+        else:
+            answer = self.field(x_canonical, posed.own.condition, to_observation)
         return answer if branch == "full" else answer.base or answer
 
     def to_canonical(
-        self, x_posed: Float[Tensor, "S 3"], posed: PosedAvatar
+        self, x_posed: Float[Tensor, "S 3"], posed: Posed
     ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 3"]]:
         """See `Avatar.to_canonical`; the nearest vertices are exact, `render` takes them from the shell's lists."""
-        distances, nearest = nearest_vertices(x_posed, posed.body.vertices, posed.neighbours)
-        return self._carried(x_posed, nearest, self._weigh(distances.square()), posed)
+        surface = posed.own.surface
+        distances, nearest = nearest_vertices(x_posed, posed.body.vertices, surface.neighbours)
+        weights = self.deformation.weigh(distances.square())
+        x_canonical, by_posed = to_canonical(x_posed, nearest, weights, surface.forward)
+        return x_canonical, self._normal_matrices(x_canonical, by_posed, posed)
 
 
-_TABLE_PAYS = 150_000
-"""Samples from which on a distance table at 15 mm, of some eighty thousand nodes, is the quicker way."""
 _BETA_UNIT = 0.01
 """Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""

@@ -7,10 +7,12 @@ from dataclasses import replace
 from twofold.field.factorized import FactorizedFieldConfig
 from twofold.field.factorized_grid import GridFieldConfig
 from twofold.losses import LossConfig
-from twofold.methods.factorized import FactorizedConfig, PoseConfig
-from twofold.methods.placing import ShellSampler
+from twofold.methods.factorized import FactorizedConfig
+from twofold.methods.factorized_config import RateConfig
+from twofold.methods.pose_schedule import PoseConfig
 from twofold.recipe import PixelConfig, Recipe, TrainingConfig
 from twofold.sampling.error_bounded import ErrorBoundedSampler
+from twofold.sampling.shell_sampler import ShellSampler
 
 
 def released() -> Recipe:
@@ -37,9 +39,7 @@ def released() -> Recipe:
             outliers_in_shading=False,
             scene_scale="released",
         ),
-        training=TrainingConfig(
-            pixels=PixelConfig(reachable="box", subject="any", replacement=False, rounded=False), epochs="steps"
-        ),
+        training=TrainingConfig(pixels=PixelConfig(reachable="box", subject="any", replacement=False), epochs="steps"),
     )
 
 
@@ -64,11 +64,9 @@ def paper() -> Recipe:
         weights, mask=0.0, s3im=0.0, reduction="sum", eikonal=summed * weights.eikonal, lpips=summed * weights.lpips
     )
     pose = replace(start.method.pose, divide_by_pi=False, with_root=True, zero_until=0, zero_every=0)
-    method = replace(start.method, field=field, losses=losses, pose=pose)
-    rate = 5e-4
-    training = replace(
-        start.training, rate_low=rate, rate_high=rate, rate_beta=rate, rate_pose=rate, adam_betas=(0.9, 0.99)
-    )
+    rates = RateConfig(low=5e-4, high=5e-4, beta=5e-4, pose=5e-4)
+    method = replace(start.method, field=field, losses=losses, pose=pose, rates=rates)
+    training = replace(start.training, adam_betas=(0.9, 0.99))
     return replace(start, name="paper", method=method, training=training)
 
 
@@ -103,7 +101,7 @@ def fast() -> Recipe:
         outliers_in_shading=True,
         scene_scale="metres",
     )
-    pixels = replace(start.training.pixels, reachable="body", subject="half", replacement=True, rounded=True)
+    pixels = replace(start.training.pixels, reachable="body", subject="half", replacement=True)
     return replace(start, name="fast", method=method, training=replace(start.training, pixels=pixels, epochs="images"))
 
 
@@ -113,7 +111,7 @@ def quick() -> Recipe:
         name="quick",
         method=FactorizedConfig(
             field=GridFieldConfig(),
-            sampler=ShellSampler(radius=0.06, step=0.01, least_weight=2e-3, stray=0.006),
+            sampler=ShellSampler(radius=0.06, step=0.01, min_weight=2e-3, miswarp_slack=0.006),
             losses=LossConfig(
                 eikonal=0.05,
                 mask=0.3,
@@ -124,6 +122,7 @@ def quick() -> Recipe:
                 eikonal_points=512,
                 eikonal_replacement=True,
             ),
+            rates=RateConfig(low=2e-3, high=2e-3, grid=1e-2, beta=3e-4, pose=5e-4),
             pose=PoseConfig(
                 zero_until=200, zero_every=0, drop=0.2, refine_from=200, canonical_shape="refined", test_shape="refined"
             ),
@@ -149,13 +148,7 @@ def quick() -> Recipe:
                 reachable="body",
                 subject="half",
                 replacement=True,
-                rounded=True,
             ),
-            rate_low=2e-3,
-            rate_high=2e-3,
-            rate_grid=1e-2,
-            rate_beta=3e-4,
-            rate_pose=5e-4,
             milestones=(),
             epochs="images",
             warmup=30,

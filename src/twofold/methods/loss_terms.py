@@ -38,12 +38,9 @@ def loss_terms(
     if config.eikonal:
         terms["eikonal"] = losses.eikonal(gradients(points_near(vertices, config, generator)))
     if config.mask:
-        hard = config.mask_form == "hard"
-        terms["mask"] = (
-            losses.hard_mask(rendering.opacity, batch.mask, batch.singles)
-            if hard
-            else losses.mask(rendering.opacity, batch.mask, "mean" if config.mask_form == "mean" else "sides")
-        )
+        terms["mask"] = _mask_term(config, rendering.opacity, batch)
+    if config.base_mask and rendering.base is not None:
+        terms["base_mask"] = _mask_term(config, rendering.base.opacity, batch)
     if config.s3im and batch.singles:
         singles = slice(0, batch.singles)
         terms["s3im"] = losses.s3im(rendering.color[singles], batch.color[singles], generator, config.s3im_center)
@@ -51,6 +48,12 @@ def loss_terms(
         patches = patch_pair(config, rendering.color, batch)
         terms["lpips"] = perceptual(*patches, config.lpips_dropout, generator).mean()
     return {name: getattr(config, name) * term for name, term in terms.items()}
+
+
+def _mask_term(config: LossConfig, opacity: Tensor, batch: Batch) -> Tensor:
+    if config.mask_form == "hard":
+        return losses.hard_mask(opacity, batch.mask, batch.singles)
+    return losses.mask(opacity, batch.mask, "mean" if config.mask_form == "mean" else "sides")
 
 
 def points_near(vertices: Float[Tensor, "V 3"], config: LossConfig, generator: torch.Generator) -> Float[Tensor, "n 3"]:

@@ -1,10 +1,11 @@
 """The methods: one line each. Recipes, command-line choices and tests are made from this table."""
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from twofold.config import KIND, from_dict, to_dict
+from twofold.config import KIND, from_dict, to_dict, with_overrides
 from twofold.errors import TwofoldError
 from twofold.inputs import shown
 from twofold.methods import factorized_recipes
@@ -42,6 +43,60 @@ class _Rest:
     seed: int = 0
 
 
+RENAMES: dict[str, str] = {
+    "training.rate_low": "method.rates.low",
+    "training.rate_high": "method.rates.high",
+    "training.rate_grid": "method.rates.grid",
+    "training.rate_beta": "method.rates.beta",
+    "training.rate_pose": "method.rates.pose",
+    "method.sampler.least_weight": "method.sampler.min_weight",
+    "method.sampler.stray": "method.sampler.miswarp_slack",
+    "method.sampler.table_voxel": "method.sampler.sdf_grid_voxel",
+}
+"""Settings that had another name: stored recipes and `--set` may use either."""
+
+DROPPED = ("training.pixels.rounded",)
+"""Settings that stored recipes may have and that have no effect any more."""
+
+
+def with_settings(recipe: Recipe, settings: Sequence[str]) -> Recipe:
+    """The recipe with settings such as "training.steps=500" changed; old names count as the new ones.
+
+    Raises:
+        TwofoldError: an unknown setting, or a value that does not fit.
+    """
+    renamed = [RENAMES.get(key, key) + equals + value for key, equals, value in (s.partition("=") for s in settings)]
+    return with_overrides(recipe, renamed)
+
+
+def _renamed(data: dict[str, Any]) -> dict[str, Any]:
+    """Stored settings under their present names."""
+    new = json.loads(json.dumps(data))
+    for old in DROPPED:
+        *parents, leaf = old.split(".")
+        (_inside(new, parents) or {}).pop(leaf, None)
+    for old, present in RENAMES.items():
+        *parents, leaf = old.split(".")
+        place = _inside(new, parents)
+        if place is not None and leaf in place:
+            value = place.pop(leaf)
+            *parents, leaf = present.split(".")
+            target = new
+            for parent in parents:
+                target = target.setdefault(parent, {})
+            target.setdefault(leaf, value)
+    return new
+
+
+def _inside(data: dict[str, Any], path: list[str]) -> dict[str, Any] | None:
+    """The object at a path, or None where there is none."""
+    for name in path:
+        data = data.get(name)  # type: ignore[assignment]
+        if not isinstance(data, dict):
+            return None
+    return data
+
+
 def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
     """A recipe as JSON data; the method's configuration carries the name of its class."""
     method = {KIND: type(recipe.method).__name__, **to_dict(recipe.method)}
@@ -60,7 +115,7 @@ def recipe_from_dict(data: object, where: str) -> Recipe:
     """
     if not isinstance(data, dict):
         raise TwofoldError(f"{where} should hold an object with a recipe; it holds {type(data).__name__}.")
-    whole = cast(dict[str, Any], completed(cast(dict[str, object], data)))
+    whole = cast(dict[str, Any], completed(_renamed(cast(dict[str, Any], data))))
     method = whole.get("method")
     if not isinstance(method, dict):
         raise TwofoldError(f"{where} lacks the method's settings, an object called method; it is damaged.")

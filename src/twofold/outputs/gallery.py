@@ -74,10 +74,10 @@ def beside_truth(
 
 def shown_truth(frame: Frame, background: Float[Tensor, "3"]) -> Float[Tensor, "h w 3"]:
     """A frame's own picture on the background; what is ignored there is hatched in grey."""
-    mask, ignored = frame.mask()[..., None], frame.ignored()
+    ignored = frame.ignored()
     rows, columns = (torch.arange(size) for size in ignored.shape)
     hatch = torch.where((rows[:, None] + columns) % 6 < 2, 0.75, 0.5)[..., None]
-    return torch.where(ignored[..., None], hatch, frame.image() * mask + background * (1 - mask))
+    return torch.where(ignored[..., None], hatch, frame.composited(background))
 
 
 def comparison(

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,9 +18,28 @@ from twofold.deform.skinning import neighbour_weights, to_posed, vertex_transfor
 from twofold.errors import TwofoldError
 from twofold.geometry.surfaces import face_areas, nearest_vertices
 from twofold.kernels.kdtree import search_tree
+from twofold.methods.base import Avatar, PosedAvatar
 
 CORNERS = tuple(itertools.product((0, 1), repeat=3))
 """Of a grid cell."""
+
+
+def posed_surface(
+    avatar: Avatar, posed: PosedAvatar[Any], voxel: float = 0.008, branch: str = "full"
+) -> tuple[Float[Tensor, "W 3"], Int[Tensor, "F 3"]]:
+    """The avatar's surface in a pose, metres: extracted in the space of its level, canonical surfaces then posed.
+
+    Raises:
+        TwofoldError: see `extract_surface`.
+    """
+
+    def level(x: Tensor) -> Tensor:
+        return avatar.level(x.to(avatar.device), posed, branch)
+
+    if avatar.level_space == "posed":
+        return extract_surface(level, posed.body.vertices.detach(), voxel)
+    vertices, faces = extract_surface(level, posed.body.canonical_vertices, voxel)
+    return pose_surface(vertices, posed.body), faces
 
 
 @torch.no_grad()

@@ -6,11 +6,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from twofold.config import require_within
-from twofold.geometry.cameras import Rays
+from twofold.deform.skinning import to_canonical
+from twofold.geometry.cameras import Rays, clip_to_box, without_tiny_components
+from twofold.kernels.kdtree import query_nearest, search_tree
+from twofold.sampling.joint_box import RELEASED_MARGIN, joint_box
+from twofold.sampling.placement import Deformation, FieldQuery, Placement, placement
+from twofold.sampling.posed_surface import PosedSurface
+from twofold.sampling.shell import Shell, build_shell
 from twofold.volume.rendering import laplace_density
 from twofold.volume.samples import Samples
 
@@ -158,6 +164,33 @@ class ErrorBoundedSampler:
         )
         if not 0 <= self.extra <= self.refined:
             raise ValueError(f"extra={self.extra} depths cannot be chosen from refined={self.refined}")
+
+    @property
+    def reach(self) -> float:
+        """How far from the body samples can be, metres."""
+        return RELEASED_MARGIN
+
+    def shell(self, body: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], neighbours: int) -> Shell:
+        """A coarse shell, which this sampler does not use; others that look at a posed avatar may."""
+        return build_shell(body, faces, 0.1, 0.03, max(6, 2 * neighbours))
+
+    def ray_box(
+        self, joints: Float[Tensor, "24 3"], given: Callable[[], Float[Tensor, "24 3"]], scale: float
+    ) -> Float[Tensor, "2 3"]:
+        """Where rays begin and end: a box around the posed joints, or around those of the pose as given.
+
+        Args:
+            joints: of the corrected pose, metres.
+            given: those of the pose as given.
+            scale: scene units to a metre.
+        """
+        return joint_box(joints) if self.box == "posed" else joint_box(given(), scale)
+
+    def build(
+        self, deformation: Deformation, canonical: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+    ) -> "ErrorBoundedPlacer":
+        """The sampler of one avatar; the canonical body is not used."""
+        return ErrorBoundedPlacer(self, deformation)
 
     @torch.no_grad()
     def sample(
@@ -313,3 +346,43 @@ def _even_quantiles(count: int, like: Tensor) -> Tensor:
 def _random(shape: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
     """Uniform in 0..1, drawn on the generator's device, so that a seed means the same everywhere."""
     return torch.rand(shape, generator=generator, dtype=like.dtype, device=generator.device).to(like.device)
+
+
+class ErrorBoundedPlacer:
+    """Places samples in the box around the posed joints by `ErrorBoundedSampler`."""
+
+    def __init__(self, config: ErrorBoundedSampler, deformation: Deformation) -> None:
+        """Keeps the configuration."""
+        self.config, self.deformation = config, deformation
+
+    def place(
+        self, rays: Rays, surface: PosedSurface, query: FieldQuery, training: bool, generator: torch.Generator | None
+    ) -> Placement:
+        """See `twofold.sampling.placement.Sampler`."""
+        deformation, k = self.deformation, surface.neighbours
+        scale = deformation.scale if self.config.units == "scene" else 1.0
+        rays = without_tiny_components(rays) if self.config.box == "given" else rays
+        clipped, hit = clip_to_box(rays, *surface.box)
+        inside = hit.nonzero()[:, 0]
+        seen = clipped[inside]
+        seen = Rays(seen.origins * scale, seen.directions, seen.near * scale, seen.far * scale)
+        tree = search_tree(surface.body.vertices.detach().cpu().numpy())
+
+        def nearest_to(points: Tensor) -> tuple[Tensor, Tensor]:
+            away, index = query_nearest(tree, points.detach().cpu().numpy(), k)
+            return torch.from_numpy(index).to(points.device), torch.from_numpy(away).float().to(points.device)
+
+        def sdf(points: Tensor) -> Tensor:
+            points = points / scale
+            index, apart = nearest_to(points)
+            x_canonical, _ = to_canonical(points, index, deformation.weigh(apart**2), surface.forward.detach())
+            value = query.distance(x_canonical)
+            # The release treats outliers as empty only when it does not train.
+            return value if training else torch.where(apart[:, 0] > deformation.outlier_distance, 4.0, value)
+
+        with torch.no_grad():
+            samples = self.config.sample(seen, sdf, query.beta, generator, generator is not None)
+        samples = Samples(inside[samples.ray_index], samples.depth / scale, samples.delta / scale)
+        index, apart = nearest_to(samples.points(rays))
+        outlier = apart[:, 0] > deformation.outlier_distance
+        return placement(samples, rays, index, deformation.weigh(apart**2), outlier, surface)

@@ -1,6 +1,7 @@
 """Training: one loop for a CPU, a GPU and several processes, readable in one sitting."""
 
 import contextlib
+import itertools
 import math
 import signal
 import threading
@@ -20,9 +21,10 @@ from twofold.capture.types import Capture, Frame
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors
 from twofold.kernels.runtime import flush_denormals
-from twofold.methods.base import Avatar, Subject
-from twofold.methods.placing import RELEASED_MARGIN, RELEASED_SLACK
+from twofold.methods.base import Avatar, Mode, Stage
+from twofold.methods.subject import Subject
 from twofold.recipe import Recipe, TrainingConfig
+from twofold.sampling.joint_box import RELEASED_MARGIN, RELEASED_SLACK
 from twofold.training.curves import Curves
 from twofold.training.lock import locked
 from twofold.training.pixels import PixelSource
@@ -41,6 +43,8 @@ from twofold.training.run import (
     write_checkpoint,
 )
 
+MOST_RESTARTS = 5
+"""Times that a training may begin again by itself."""
 ROW_EVERY = 20
 """Steps between two rows of the curves."""
 COMPILED = "The networks are compiled (torch.compile): the first step takes minutes."
@@ -60,29 +64,31 @@ class Progress:
 class Step(nn.Module):
     """One training step's losses as a module's `forward`, which is where DDP synchronises gradients."""
 
-    background: Tensor
+    color: Tensor
 
-    def __init__(self, avatar: Avatar, source: PixelSource, background: Float[Tensor, "3"], recipe: Recipe) -> None:
-        """Everything a step needs beside its number."""
+    def __init__(self, avatar: Avatar, source: PixelSource, color: Float[Tensor, "3"], stage: Stage, seed: int) -> None:
+        """Everything a step needs beside its number; `color` is the capture's background."""
         super().__init__()
-        self.avatar, self.source, self.recipe = avatar, source, recipe
-        self.register_buffer("background", background, persistent=False)
+        self.avatar, self.source, self.stage, self.seed = avatar, source, stage, seed
+        self.register_buffer("color", color, persistent=False)
 
-    def forward(self, step: int, team: Team) -> tuple[dict[str, Tensor], Tensor]:
-        """Mean loss terms of this process's share of the step's pictures, and the mean squared error of its colours."""
-        images = self.recipe.training.images_per_step // team.size
-        order = frame_order(self.recipe, len(self.source.frames), step)
+    def forward(self, step: int, mode: Mode, team: Team) -> tuple[dict[str, Tensor], Tensor]:
+        """Mean loss terms of this process's part of the step's images, and the mean squared error of its colours."""
+        training = self.stage.training
+        images = training.images_per_step // team.size
+        order = frame_order(training, self.seed, len(self.source.frames), step)
         terms: dict[str, Tensor] = {}
-        error = torch.zeros((), device=self.background.device)
+        error = torch.zeros((), device=self.color.device)
         for slot in range(team.rank * images, (team.rank + 1) * images):
             # Every choice follows from seed, step and slot, so a resumed run and any number of processes make the same.
-            generator = torch.Generator().manual_seed(mixed(self.recipe.seed, step, slot))
+            generator = torch.Generator().manual_seed(mixed(self.seed, step, slot))
             which = order[slot]
             frame = self.source.frames[which]
-            batch = self.source.draw(which, generator, self.background.device)
-            posed = self.avatar.pose(frame.pose, frame.translation, frame.time, step)
-            rendering = self.avatar.render(batch.rays, posed, self.background, generator)
-            for name, term in self.avatar.losses(rendering, batch, posed, step, generator).items():
+            batch = self.source.draw(which, generator, self.color.device)
+            batch = batch.against(self.avatar.background(self.color, len(batch.rays), generator))
+            posed = self.avatar.pose(frame.pose, frame.translation, frame.time, mode)
+            rendering = self.avatar.render(batch.rays, posed, batch.background, mode, generator)
+            for name, term in self.avatar.losses(rendering, batch, posed, mode, generator).items():
                 terms[name] = terms.get(name, 0) + term / images
             error = error + (rendering.color.detach() - batch.color).square().mean() / images
         return terms, error
@@ -91,6 +97,18 @@ class Step(nn.Module):
 def mixed(*numbers: int) -> int:
     """A seed from several numbers, well spread."""
     return int(np.random.SeedSequence(list(numbers)).generate_state(1, np.uint64)[0]) >> 1
+
+
+def frame_order(config: TrainingConfig, seed: int, frames: int, step: int) -> list[int]:
+    """Which frames a step sees: each epoch goes through all of them in an order of its own."""
+    images = config.images_per_step
+    # Positions in an endless row of epochs; whole steps make every epoch as long as all its steps.
+    length = frames if config.epochs == "images" else images * math.ceil(frames / images)
+    chosen = []
+    for position in range(step * images, (step + 1) * images):
+        generator = torch.Generator().manual_seed(mixed(seed, 7, position // length))
+        chosen.append(int(torch.randperm(frames, generator=generator)[position % length % frames]))
+    return chosen
 
 
 def epoch_steps(config: TrainingConfig, frames: int) -> int | float:
@@ -103,16 +121,15 @@ def epoch_steps(config: TrainingConfig, frames: int) -> int | float:
     return steps if config.epochs == "images" else math.ceil(steps)
 
 
-def frame_order(recipe: Recipe, frames: int, step: int) -> list[int]:
-    """Which frames a step looks at: each epoch goes through all of them in an order of its own."""
-    config, images = recipe.training, recipe.training.images_per_step
-    # Positions in an endless row of epochs; whole steps make every epoch as long as all its steps.
-    length = frames if config.epochs == "images" else images * math.ceil(frames / images)
-    chosen = []
-    for position in range(step * images, (step + 1) * images):
-        generator = torch.Generator().manual_seed(mixed(recipe.seed, 7, position // length))
-        chosen.append(int(torch.randperm(frames, generator=generator)[position % length % frames]))
-    return chosen
+def mode_at(config: TrainingConfig, step: int, frames: int) -> Mode:
+    """The mode of a training step: its epoch, and whether it is the epoch's first step.
+
+    >>> mode_at(TrainingConfig(epochs="steps"), 6, 5)
+    Mode(step=6, epoch=2, starts_epoch=True)
+    """
+    steps = epoch_steps(config, frames)
+    epoch = int(step // steps)
+    return Mode(step, epoch, step == 0 or epoch > int((step - 1) // steps))
 
 
 def rate_factor(config: TrainingConfig, step: int, frames: int) -> float:
@@ -129,10 +146,7 @@ def rate_factor(config: TrainingConfig, step: int, frames: int) -> float:
 
 def make_optimizer(avatar: Avatar, config: TrainingConfig) -> torch.optim.Optimizer:
     """Adam with one learning rate a parameter group."""
-    groups = []
-    for name, parameters in avatar.parameter_groups().items():
-        if parameters:
-            groups.append({"params": parameters, "lr": getattr(config, f"rate_{name}"), "name": name})
+    groups = [{"params": g.parameters, "lr": g.rate, "name": g.name} for g in avatar.parameter_groups() if g.parameters]
     return torch.optim.Adam(groups, betas=config.adam_betas, eps=config.adam_epsilon, fused=True)
 
 
@@ -162,7 +176,7 @@ def train(
 
     Raises:
         TwofoldError: unusable settings, a checkpoint that does not fit, another capture than the run was begun with,
-            a loss that is not finite, an unwritable folder, another process that trains in it.
+            a loss that is not finite, an unwritable folder.
         KeyboardInterrupt: passed on after the state has been stored.
     """
     flush_denormals()
@@ -170,11 +184,6 @@ def train(
     with (
         plain_errors(folder), joined(device) as team, asked_to_stop() as stopped, contextlib.ExitStack() as at_the_end
     ):  # fmt: skip
-        if config.images_per_step % team.size:
-            raise TwofoldError(
-                f"training.images_per_step is {config.images_per_step}, which {team.size} processes cannot share; "
-                "choose a multiple."
-            )
         if resume:
             require_same(folder, capture, motion=True)
         subject = read_subject(folder) if resume else Subject.of(capture)
@@ -195,46 +204,35 @@ def train(
             start_folder(folder, recipe, subject, capture.folder, tuple(notes))
             if not begun:
                 at_the_end.enter_context(locked(folder))
-        avatar.count_epochs(epoch_steps(config, len(capture.train)))
-        optimizer = make_optimizer(avatar, config)
-        start = _restore(folder, avatar, optimizer) if resume else 0
-        margin = getattr(recipe.method.sampler, "radius", 0.3) + 0.02
-        box = RELEASED_MARGIN + RELEASED_SLACK / subject.scene_scale
-        source = PixelSource(capture.train, subject.body, subject.betas, config.pixels, capture.background, margin, box)
-        module: nn.Module = Step(avatar, source, torch.tensor(capture.background, device=device), recipe)
-        if team.size > 1:
-            module = team.shared(module)
-        curves = Curves(folder, start) if team.leads else None
+        run = _Run(capture, recipe, folder, device, team, avatar)
+        run.restore(resume)
+        curves = Curves(folder, run.step) if team.leads else None
         if curves is not None:
             at_the_end.callback(curves.close)
-        base_rates = [group["lr"] for group in optimizer.param_groups]
-        for step in range(start, config.steps):
-            avatar.before_step(step)
-            factor = rate_factor(config, step, len(capture.train))
-            for group, rate in zip(optimizer.param_groups, base_rates, strict=True):
-                group["lr"] = rate * factor
-            terms, error = module(step, team)
-            optimizer.zero_grad(set_to_none=True)
-            losses.total(terms).backward()
-            if config.clip:
-                nn.utils.clip_grad_norm_([p for g in optimizer.param_groups for p in g["params"]], config.clip)
-            optimizer.step()
-            done = step + 1
-            report, stop = _agreed(team, terms, error, stopped(), done, config.steps)
+        while run.step < run.steps:
+            terms, error = run.advance()
+            done, steps = run.step, run.steps
+            report, stop = _agreed(team, terms, error, stopped(), done, steps)
+            if avatar.after_step(run.mode, capture) == "restart":
+                run.restart()
+                if curves is not None:
+                    curves.rows.clear()
+                if say and team.leads:
+                    say(f"The training started again at step {done}, from other initial weights: nothing was visible.")
+                continue
             if curves is not None:
                 if watch:
                     watch(report)
-                if done % ROW_EVERY == 0 or done == config.steps:
-                    curves.add({"step": float(done), **report.losses, "psnr": report.psnr, **_scale(avatar)})
-                if done % ROW_EVERY == 0 or done == config.steps:
+                if done % ROW_EVERY == 0 or done == steps:
+                    curves.add({"step": float(done), **report.losses, "psnr": report.psnr, **avatar.scalars()})
                     require_finite(avatar.state_dict(), folder, done)
-                if done == config.steps:
+                if done == steps:
                     require_finite({"the surface": _level_on_body(avatar, capture.train[0])}, folder, done)
-                if done % config.checkpoint_every == 0 or done == config.steps or stop:
+                if done % config.checkpoint_every == 0 or done == steps or stop:
                     # In this order: the curves are cut back to the checkpoint, not the other way round.
                     curves.save()
-                    write_checkpoint(folder, avatar, optimizer, done)
-                if preview and config.preview_every and done % config.preview_every == 0 and done < config.steps:
+                    write_checkpoint(folder, avatar, run.optimizer, done, run.restarts)
+                if preview and config.preview_every and done % config.preview_every == 0 and done < steps:
                     avatar.eval()
                     preview(avatar, done)
                     avatar.train()
@@ -251,14 +249,106 @@ def _level_on_body(avatar: Avatar, frame: Frame) -> Float[Tensor, "V"]:
     return avatar.level(posed.body.canonical_vertices, posed)
 
 
-def _restore(folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer) -> int:
-    """Puts the checkpoint's state back and tells its step; 0 where there is none yet."""
-    if not (folder / CHECKPOINT).is_file():
-        return 0
-    tensors, start = read_checkpoint(folder)
-    load_state(avatar, {n[7:]: t for n, t in tensors.items() if n.startswith("avatar.")}, folder)
-    load_optimizer(optimizer, tensors)
-    return start
+class _Run:
+    """The state of a training between steps: its stage, optimizer and pixels."""
+
+    def __init__(
+        self, capture: Capture, recipe: Recipe, folder: Path, device: torch.device, team: Team, avatar: Avatar
+    ) -> None:
+        self.capture, self.folder, self.team, self.avatar = capture, folder, team, avatar
+        self.recipe, self.step, self.restarts = recipe, 0, 0
+        self.stages = avatar.stages(recipe.training)
+        for stage in self.stages:
+            images = stage.training.images_per_step
+            if images % team.size:
+                raise TwofoldError(
+                    f"images_per_step is {images}, which {team.size} processes cannot share; choose a multiple."
+                )
+        self.ends = list(itertools.accumulate(stage.training.steps for stage in self.stages))
+        self.steps = self.ends[-1]
+        self.color = torch.tensor(capture.background, device=device)
+        self.current = -1
+
+    @property
+    def seed(self) -> int:
+        """The recipe's seed; another one after each restart."""
+        return mixed(self.recipe.seed, 13, self.restarts) % 2**32 if self.restarts else self.recipe.seed
+
+    @property
+    def begin(self) -> int:
+        """The first step of the current stage."""
+        return self.ends[self.current] - self.stages[self.current].training.steps
+
+    @property
+    def mode(self) -> Mode:
+        """Of the step that was made last, or of the first one."""
+        step = max(self.step - 1 - self.begin, 0)
+        return self._mode(step)
+
+    def _mode(self, step: int) -> Mode:
+        return mode_at(self.stages[self.current].training, step, len(self.capture.train))
+
+    def restore(self, resume: bool) -> None:
+        """Puts the checkpoint's state back; a new run begins its first stage."""
+        if not resume or not (self.folder / CHECKPOINT).is_file():
+            self._enter(0, prepared=False)
+            return
+        tensors, self.step, self.restarts = read_checkpoint(self.folder)
+        load_state(self.avatar, {n[7:]: t for n, t in tensors.items() if n.startswith("avatar.")}, self.folder)
+        # A checkpoint at the very end of a stage still holds that stage's state.
+        self._enter(next((i for i, end in enumerate(self.ends) if self.step <= end), len(self.ends) - 1), prepared=True)
+        load_optimizer(self.optimizer, tensors)
+
+    def _enter(self, stage: int, prepared: bool) -> None:
+        self.current = stage
+        chosen, frames = self.stages[stage], self.capture.train
+        if not prepared:
+            generator = torch.Generator().manual_seed(mixed(self.seed, 11, stage, self.restarts))
+            self.avatar.prepare_training(self.capture, stage, generator)
+        self.optimizer = make_optimizer(self.avatar, chosen.training)
+        self.rates = [group["lr"] for group in self.optimizer.param_groups]
+        subject = self.avatar.subject
+        margins = self.avatar.ray_margin, RELEASED_MARGIN + RELEASED_SLACK / subject.scene_scale
+        source = PixelSource(frames, subject.body, subject.betas, chosen.training.pixels, *margins)
+        module = Step(self.avatar, source, self.color, chosen, self.seed)
+        self.module = self.team.shared(module) if self.team.size > 1 else module
+
+    def advance(self) -> tuple[dict[str, Tensor], Tensor]:
+        """Makes one step."""
+        if self.step == self.ends[self.current]:
+            self._enter(self.current + 1, prepared=False)
+        config = self.stages[self.current].training
+        within = self.step - self.begin
+        mode = self._mode(within)
+        self.avatar.before_step(mode)
+        factor = rate_factor(config, within, len(self.capture.train))
+        for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
+            group["lr"] = rate * factor
+        terms, error = self.module(self.step, mode, self.team)
+        self.optimizer.zero_grad(set_to_none=True)
+        losses.total(terms).backward()
+        if config.clip:
+            parameters = [p for g in self.optimizer.param_groups for p in g["params"]]
+            nn.utils.clip_grad_norm_(parameters, config.clip)
+        self.optimizer.step()
+        self.step += 1
+        return terms, error
+
+    def restart(self) -> None:
+        """Begins the training again from other random choices.
+
+        Raises:
+            TwofoldError: it has done so too often.
+        """
+        self.restarts += 1
+        if self.restarts > MOST_RESTARTS:
+            raise TwofoldError(
+                f"The training of {self.folder} showed nothing {MOST_RESTARTS} times; check the masks and poses of the "
+                "capture with `twofold check`, or choose another --seed."
+            )
+        self.step = 0
+        self.avatar.load_state_dict(self.recipe.method.build(self.avatar.subject, self.seed).state_dict())
+        self._enter(0, prepared=False)
 
 
 def _agreed(
@@ -278,12 +368,6 @@ def _agreed(
             "poses."
         )
     return Progress(done, steps, named, -10 * math.log10(max(error_mean, 1e-10))), stopping > 0
-
-
-def _scale(avatar: Avatar) -> dict[str, float]:
-    """The density's scale, for the curves of methods that have one."""
-    beta = getattr(avatar, "beta", None)
-    return {"beta": float(beta.detach())} if isinstance(beta, Tensor) else {}
 
 
 @contextlib.contextmanager

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from torch import Tensor
 
@@ -25,10 +25,13 @@ class _Picture:
     inside: Bool[Tensor, "h w"]
     known: Bool[Tensor, "h w"]
 
-    def colors(self, index: Tensor) -> Tensor:
-        """Of pixels by their flat index, 0..1."""
-        found = self.image.flatten(0, 1)[index]
-        return found.float() / 255 if found.dtype == torch.uint8 else found
+    def colors(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+        """Colours of flat pixels, 0..1."""
+        return self.image.flatten(0, 1)[index].float() / 255
+
+    def coverage(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """Share of flat pixels that the person covers, 0..1."""
+        return self.mask.flatten()[index].float() / 255
 
 
 class PixelSource:
@@ -36,7 +39,7 @@ class PixelSource:
 
     def __init__(
         self, frames: tuple[Frame, ...], body: Body, betas: Float[Tensor, "S"], config: PixelConfig,
-        background: tuple[float, float, float], margin: float = 0.31, box_margin: float = 0.31,
+        margin: float = 0.31, box_margin: float = 0.31,
     ) -> None:  # fmt: skip
         """Nothing is read yet.
 
@@ -45,13 +48,11 @@ class PixelSource:
             body: who is in them.
             betas: that person's shape.
             config: how to draw.
-            background: colour put outside the mask, 0..1.
             margin: how far from the body pixels are reachable, metres.
             box_margin: how far the box of the joints reaches beyond them, metres.
         """
         self.frames, self.config, self.margin, self.box_margin = frames, config, margin, box_margin
         self._shaped = shape_body(body, betas)
-        self._background = torch.tensor(background)
         self._pictures: dict[int, _Picture] = {}
 
     def picture(self, which: int) -> _Picture:
@@ -66,7 +67,7 @@ class PixelSource:
 
     def _read(self, frame: Frame) -> _Picture:
         mask = frame.mask()
-        image = frame.image() * mask[..., None] + self._background * (1 - mask[..., None])
+        image = frame.image()
         inside = mask > (0.5 if self.config.subject == "half" else 0)
         if not inside.any():
             limit = 127 if self.config.subject == "half" else 0
@@ -95,7 +96,7 @@ class PixelSource:
             )
         subject &= reachable
         return _Picture(
-            (image * 255).round().to(torch.uint8) if self.config.rounded else image,
+            (image * 255).round().to(torch.uint8),
             (mask * 255).round().to(torch.uint8),
             subject.flatten().nonzero()[:, 0].int(),
             reachable.flatten().nonzero()[:, 0].int(),
@@ -131,15 +132,15 @@ class PixelSource:
             for pool, count in ((picture.subject, near), (picture.reachable, config.rays - near))
         ]
         patches = torch.full((config.patches, config.patch_size, config.patch_size), -1, dtype=torch.long)
-        background = self._background.to(torch.float32)
-        patch_color = background.expand(*patches.shape, 3).clone()
+        patch_image, patch_mask = torch.zeros(*patches.shape, 3), torch.zeros(patches.shape)
         used = config.rays
         reachable = torch.zeros(height * width, dtype=torch.bool)
         reachable[picture.reachable.long()] = True
         for patch in range(config.patches):
             window, within = self._window(picture, reachable, generator)
             shown = within & picture.known.flatten()[window]
-            patch_color[patch].view(-1, 3)[shown] = picture.colors(window[shown])
+            patch_image[patch].view(-1, 3)[shown] = picture.colors(window[shown])
+            patch_mask[patch].view(-1)[shown] = picture.coverage(window[shown])
             rays = (within & reachable[window]).nonzero()[:, 0]
             patches[patch].view(-1)[rays] = torch.arange(used, used + len(rays))
             chosen.append(window[rays])
@@ -149,12 +150,13 @@ class PixelSource:
         rays = pixel_rays(self.frames[which].camera, position)
         return Batch(
             rays=Rays(*(t.to(device) for t in (rays.origins, rays.directions, rays.near, rays.far))),
-            color=picture.colors(index).to(device),
-            mask=(picture.mask.flatten()[index].float() / 255).to(device),
+            image=picture.colors(index).to(device),
+            mask=picture.coverage(index).to(device),
             singles=config.rays,
             patch_pixels=patches.to(device),
-            patch_color=patch_color.to(device),
-            background=background.to(device),
+            patch_image=patch_image.to(device),
+            patch_mask=patch_mask.to(device),
+            frame_index=self.frames[which].time,
         )
 
     def _choose(self, pool: int, count: int, generator: torch.Generator) -> Tensor:

@@ -20,7 +20,8 @@ from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.files import new_folder, plain_errors, write_atomically, write_json, write_npz
 from twofold.inputs import is_there, read_json, require_file, shown, shown_path
-from twofold.methods.base import Avatar, Subject
+from twofold.methods.base import Avatar
+from twofold.methods.subject import Subject
 from twofold.methods.table import recipe_from_dict, recipe_to_dict
 from twofold.npz import read_npz
 from twofold.recipe import Recipe
@@ -29,7 +30,7 @@ RECIPE, ABOUT, SUBJECT, CHECKPOINT, CURVES = (
     "recipe.json", "run.json", "subject.npz", "checkpoint.safetensors", "curves.csv",
 )  # fmt: skip
 """What a run folder holds. The recipe is written last, so a folder that has one has all it takes to begin."""
-LOWER_RATES = "lower the learning rates (--set training.rate_low=... and the others) and train again"
+LOWER_RATES = "lower the learning rates (--set method.rates.low=... and the others) and train again"
 """What helps a training whose numbers run away."""
 _DAMAGED = "is damaged; train again"
 
@@ -190,7 +191,7 @@ def load(folder: Path, device: torch.device | str = "cpu") -> tuple[Avatar, int]
     """
     recipe = read_recipe(folder)
     avatar = recipe.method.build(read_subject(folder), recipe.seed)
-    tensors, step = read_checkpoint(folder)
+    tensors, step, _ = read_checkpoint(folder)
     own = {name[len("avatar.") :]: t for name, t in tensors.items() if name.startswith("avatar.")}
     load_state(avatar, own, folder)
     broken = not_finite(own)
@@ -209,6 +210,7 @@ def not_finite(tensors: Mapping[str, Tensor]) -> str:
 
 def load_state(avatar: Avatar, state: dict[str, Tensor], folder: Path) -> None:
     """Puts stored tensors into an avatar; a mismatch is a TwofoldError that names the first one."""
+    avatar.load_stored(state)
     expected = avatar.state_dict()
     wrong = [n for n, t in expected.items() if n not in state or _kind(state[n]) != _kind(t)]
     if wrong or len(expected) != len(state):
@@ -222,7 +224,9 @@ def _kind(tensor: Tensor) -> tuple[torch.Size, bool]:
     return tensor.shape, tensor.is_floating_point()
 
 
-def write_checkpoint(folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer, step: int) -> None:
+def write_checkpoint(
+    folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer, step: int, restarts: int = 0
+) -> None:
     """Stores everything that continuing needs, beside the old checkpoint and then in its place.
 
     Raises:
@@ -234,7 +238,7 @@ def write_checkpoint(folder: Path, avatar: Avatar, optimizer: torch.optim.Optimi
     require_finite(tensors, folder, step)
     whole = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     with write_atomically(folder / CHECKPOINT) as beside:
-        about = {"step": str(step), "tensors": str(len(whole)), "twofold": __version__}
+        about = {"step": str(step), "restarts": str(restarts), "tensors": str(len(whole)), "twofold": __version__}
         beside.write_bytes(save(whole, metadata=about))
 
 
@@ -250,8 +254,8 @@ def require_finite(tensors: Mapping[str, Tensor], folder: Path, step: int) -> No
         raise TwofoldError(f"The training of {folder} diverged: {name} is not finite at step {step}; {LOWER_RATES}.")
 
 
-def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], int]:
-    """The tensors of the newest checkpoint and its step.
+def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], int, int]:
+    """The tensors of the newest checkpoint, its step, and how often the training had begun again.
 
     Raises:
         TwofoldError: there is none, or it cannot be read.
@@ -272,7 +276,10 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], int]:
     # Older checkpoints do not say how many tensors they hold.
     if about.get("tensors", str(len(tensors))) != str(len(tensors)):
         raise TwofoldError(f"{file} is damaged: it lacks tensors that it was written with; train again.")
-    return tensors, int(step)
+    restarts = about.get("restarts", "0")
+    if not re.fullmatch(r"[0-9]{1,3}", restarts):
+        raise TwofoldError(f"{file} is damaged: the restarts before it are {shown(restarts)}; train again.")
+    return tensors, int(step), int(restarts)
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:

@@ -218,7 +218,7 @@ def test_leaning_is_no_turning():
         ({}, []),
         ({"yaw": 90.0}, ["only 90 degrees"]),
         ({"moved": 8.0}, ["background moves by up to 8 pixels"]),
-        ({"moved": 8.0, "several": True}, ["--set training.rate_pose=1e-4"]),
+        ({"moved": 8.0, "several": True}, ["--set method.rates.pose=1e-4"]),
         ({"moved": 6.0}, []),
         ({"moved": None}, []),
         (

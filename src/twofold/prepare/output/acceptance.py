@@ -218,7 +218,7 @@ def warnings_about(
     if several:
         words.append(
             "Several cameras agree on these poses; the one that trains cannot see their depth. Train with "
-            "--set training.rate_pose=1e-4, so that they move little."
+            "--set method.rates.pose=1e-4, so that they move little."
         )
     if left_out:
         words.append(f"{len(left_out)} moments were left out: {reasons_in_words(left_out)}.")

@@ -1,4 +1,4 @@
-"""A table of distances changes which samples the networks are asked about, and no picture."""
+"""An SDF grid changes which samples the networks are queried for, and no rendering."""
 
 from dataclasses import replace
 
@@ -6,12 +6,14 @@ import pytest
 import torch
 from small_recipes import CASES
 
-from twofold.deform.skinning import neighbour_weights
 from twofold.geometry.cameras import pixel_grid, pixel_rays
-from twofold.methods import factorized
-from twofold.methods.base import Subject
-from twofold.methods.placing import ShellSampler, astray, carried_home, place_in_shell
+from twofold.methods.base import EVALUATION, Mode
+from twofold.methods.subject import Subject
+from twofold.sampling import shell_sampler
+from twofold.sampling.placement import FieldQuery
+from twofold.sampling.pruning import miswarped
 from twofold.sampling.shell import build_shell
+from twofold.sampling.shell_sampler import ShellSampler
 from twofold.training.loop import train
 
 BLACK = torch.zeros(3)
@@ -23,7 +25,8 @@ def dense(person, tmp_path_factory):
     recipe = CASES["fast"]
     losses = replace(recipe.method.losses, mask=1.0, s3im=0.0)
     method = replace(recipe.method, beta=0.01, losses=losses, field=replace(recipe.method.field, radius=0.3))
-    training = replace(recipe.training, steps=60, preview_every=0, rate_low=2e-3, rate_high=1e-3)
+    method = replace(method, rates=replace(method.rates, low=2e-3, high=1e-3))
+    training = replace(recipe.training, steps=60, preview_every=0)
     recipe = replace(recipe, method=method, training=training)
     return train(person, recipe, tmp_path_factory.mktemp("dense") / "run", torch.device("cpu"))
 
@@ -31,23 +34,23 @@ def dense(person, tmp_path_factory):
 @pytest.fixture
 def looking(dense, person, monkeypatch):
     """Renders with a table of some spacing, and counts the samples that the distance network is asked about."""
-    monkeypatch.setattr(factorized, "_TABLE_PAYS", 10)
+    monkeypatch.setattr(shell_sampler, "_GRID_PAYS", 10)
     asked = []
     sdf = dense.field.sdf
     monkeypatch.setattr(dense.field, "sdf", lambda x, pose: asked.append(len(x)) or sdf(x, pose))
-    config = dense.config
+    config = dense._sampler.config
     frame = person.train[1]
     rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
 
     def look(spacing, posed=None):
-        dense.config = replace(config, sampler=replace(config.sampler, table_voxel=spacing))
+        dense._sampler.config = replace(config, sdf_grid_voxel=spacing)
         posed = posed or dense.pose(frame.pose, frame.translation)
         before = sum(asked)
         with torch.no_grad():
             return dense.render(rays, posed, BLACK), sum(asked) - before, posed
 
     yield look
-    dense.config = config
+    dense._sampler.config = config
 
 
 def test_pictures_are_the_same_with_a_table(looking):
@@ -73,20 +76,18 @@ def test_a_table_belongs_to_one_pose_and_one_state_of_the_field(looking, dense):
 
 
 def test_few_samples_are_asked_about_one_by_one(looking, monkeypatch):
-    monkeypatch.setattr(factorized, "_TABLE_PAYS", 10**9)
+    monkeypatch.setattr(shell_sampler, "_GRID_PAYS", 10**9)
     assert looking(0.03)[1] == looking(0.0)[1]
 
 
 def test_training_asks_about_every_sample(dense, person, looking):
     looking(0.03)
     frame = person.train[1]
-    posed = dense.pose(frame.pose, frame.translation, frame.time, 5)
+    posed = dense.pose(frame.pose, frame.translation, frame.time, Mode(5))
     rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1)[:40])
-    dense.train()
-    dense._last_table = None
-    dense.render(rays, posed, BLACK, torch.Generator().manual_seed(0))
-    assert dense._last_table is None
-    dense.eval()
+    dense._sampler._last_grid = None
+    dense.render(rays, posed, BLACK, Mode(5), torch.Generator().manual_seed(0))
+    assert dense._sampler._last_grid is None
 
 
 def test_samples_that_are_carried_to_another_part_are_air(dense, person):
@@ -95,11 +96,11 @@ def test_samples_that_are_carried_to_another_part_are_air(dense, person):
     with torch.no_grad():
         posed = dense.pose(frame.pose, frame.translation)
     rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
-    sampler = dense.config.sampler
-    placed = place_in_shell(sampler, rays, posed, 1, neighbour_weights, sampler.radius, None)
-    x = carried_home(placed, rays, posed)
-    home = build_shell(dense.canonical_points, posed.body.faces, sampler.radius, sampler.voxel)
-    stray = astray(placed, x, rays, posed, home, 0.006)
+    sampler, surface = dense.config.sampler, posed.own.surface
+    placed = sampler.build(dense.deformation, dense.canonical_points, posed.body.faces).candidates(rays, surface, None)
+    x = placed.x_canonical
+    canonical = build_shell(dense.canonical_points, posed.body.faces, sampler.radius, sampler.voxel)
+    stray = miswarped(placed, rays, surface, canonical, 0.006)
     away = (placed.samples.points(rays) - posed.body.vertices[placed.nearest[:, 0]]).norm(dim=-1)
     nearer = away - torch.cdist(x, dense.canonical_points).amin(1)
     assert 0 < stray.sum() < len(stray)
@@ -107,7 +108,7 @@ def test_samples_that_are_carried_to_another_part_are_air(dense, person):
     assert (nearer[stray] > 0.0059).all()
     # What a voxel does not list may still be nearer, hence not all.
     assert (nearer[~stray] < 0.0061).float().mean() > 0.99
-    assert not astray(placed, x, rays, posed, home, 1.0).any()
+    assert not miswarped(placed, rays, surface, canonical, 1.0).any()
 
 
 def test_strays_are_air_in_training_and_in_pictures(person):
@@ -116,22 +117,23 @@ def test_strays_are_air_in_training_and_in_pictures(person):
     rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
     counts = {}
     for stray in (0.0, 0.006):
-        sampler = replace(recipe.method.sampler, stray=stray, least_weight=0.0)
+        sampler = replace(recipe.method.sampler, miswarp_slack=stray, min_weight=0.0)
         avatar = replace(recipe.method, sampler=sampler).build(Subject.of(person))
         for training in (True, False):
-            avatar.train(training)
-            posed = avatar.pose(frame.pose, frame.translation, frame.time, 5 if training else None)
+            mode = Mode(5) if training else EVALUATION
+            posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
             noise = torch.Generator().manual_seed(0) if training else None
-            counts[stray, training] = len(avatar._place(rays, posed, noise).samples)
+            counts[stray, training] = len(avatar.place(rays, posed, mode, noise).samples)
     assert 0 < counts[0.006, True] < counts[0.0, True]
     assert 0 < counts[0.006, False] < counts[0.0, False]
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"radius": 0.0}, {"step": -1.0}, {"table_voxel": -0.1}, {"stray": -0.01}, {"table_voxel": 1e-3}]
+    "wrong",
+    [{"radius": 0.0}, {"step": -1.0}, {"sdf_grid_voxel": -0.1}, {"miswarp_slack": -0.01}, {"sdf_grid_voxel": 1e-3}],
 )
 def test_sizes_that_leave_nothing_to_sample_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"(radius|step|stray|table_voxel)=.* should be 0"):
+    with pytest.raises(ValueError, match=r"(radius|step|miswarp_slack|sdf_grid_voxel)=.* should be 0"):
         ShellSampler(**wrong)
 
 
@@ -139,4 +141,5 @@ def test_a_table_is_for_dense_networks_only(person):
     avatar = CASES["quick"].method.build(Subject.of(person)).eval()
     frame = person.train[0]
     posed = avatar.pose(frame.pose, frame.translation)
-    assert avatar._table(10**9, posed, lambda x: x[:, 0]) is None
+    query = FieldQuery(lambda x: x[:, 0], avatar.beta, avatar.field.dense)
+    assert avatar._sampler._grid(10**9, posed.own.surface, query) is None

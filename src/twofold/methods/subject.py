@@ -1,0 +1,85 @@
+"""The person that an avatar is made of."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from twofold.body.skeleton import Body
+from twofold.capture.types import Capture
+from twofold.errors import TwofoldError
+from twofold.npz import are_moderate
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The person that an avatar is made of: body and training motion. A run folder carries it as arrays.
+
+    Attributes:
+        body: the body model.
+        betas: its shape coefficients.
+        times: moments of the training frames, ascending.
+        poses: their axis-angle rotations, radians.
+        translations: their translations, metres.
+        scene_scale: what the authors' release multiplies lengths with (3 / (1.1 times the furthest camera)).
+    """
+
+    body: Body
+    betas: Float[Tensor, "S"]
+    times: Int[Tensor, "T"]
+    poses: Float[Tensor, "T 24 3"]
+    translations: Float[Tensor, "T 3"]
+    scene_scale: float
+
+    @staticmethod
+    def of(capture: Capture) -> "Subject":
+        """The subject of a capture's training frames."""
+        moments = {frame.time: frame for frame in capture.train}
+        frames = [moments[time] for time in sorted(moments)]
+        middle = torch.stack([f.translation + capture.body.joints[0] for f in frames]).mean(0)
+        away = max(float((f.camera.center - middle).norm()) for f in frames)
+        return Subject(
+            body=capture.body,
+            betas=capture.betas,
+            times=torch.tensor([f.time for f in frames]),
+            poses=torch.stack([f.pose for f in frames]),
+            translations=torch.stack([f.translation for f in frames]),
+            scene_scale=3 / (1.1 * away),
+        )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """As a run folder stores it."""
+        own = {"betas": self.betas, "times": self.times, "poses": self.poses, "translations": self.translations}
+        body = {f"body_{name}": array for name, array in self.body.arrays().items()}
+        return {**{name: t.numpy() for name, t in own.items()}, **body, "scene_scale": np.array(self.scene_scale)}
+
+    @staticmethod
+    def from_arrays(arrays: dict[str, np.ndarray], where: str) -> "Subject":
+        """What `arrays` gave, read back.
+
+        Raises:
+            TwofoldError: something is missing, has the wrong shape or is not finite.
+        """
+        shapes = {"betas": ("S",), "times": ("T",), "poses": ("T", 24, 3), "translations": ("T", 3), "scene_scale": ()}
+        missing = [name for name in shapes if name not in arrays]
+        if missing:
+            raise TwofoldError(f"{where} lacks {', '.join(missing)}; it is damaged, train again.")
+        body = Body.from_arrays({n[5:]: a for n, a in arrays.items() if n.startswith("body_")}, where)
+        sizes: dict[str | int, int] = {"S": arrays["betas"].size, "T": arrays["times"].size}
+        for name, shape in shapes.items():
+            array, expected = arrays[name], tuple(sizes.get(axis, axis) for axis in shape)
+            if array.shape != expected or array.dtype.kind not in "fiu" or not are_moderate(array):
+                raise TwofoldError(
+                    f"{name} in {where} should be finite numbers of shape {expected}, it is {array.dtype} of "
+                    f"{array.shape}; it is damaged, train again."
+                )
+        return Subject(
+            body=body,
+            betas=torch.as_tensor(arrays["betas"]).float(),
+            times=torch.as_tensor(arrays["times"]).long(),
+            poses=torch.as_tensor(arrays["poses"]).float(),
+            translations=torch.as_tensor(arrays["translations"]).float(),
+            scene_scale=float(arrays["scene_scale"]),
+        )

@@ -1,0 +1,60 @@
+"""Which placed samples are worth shading: neither mis-warped nor known to be empty or hidden."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from twofold.geometry.cameras import Rays
+from twofold.sampling.placement import Distance, Placement
+from twofold.sampling.posed_surface import PosedSurface
+from twofold.sampling.sdf_grid import SdfGrid
+from twofold.sampling.shell import Shell, nearest_listed
+from twofold.sampling.visibility import possible_samples, seen_samples
+from twofold.volume.rendering import laplace_density
+
+
+@torch.no_grad()
+def miswarped(
+    placed: Placement, rays: Rays, surface: PosedSurface, canonical: Shell, slack: float
+) -> Bool[Tensor, "S"]:
+    """Samples that inverse skinning maps to a part of the body that they are not at.
+
+    The empty space beside the neck belongs to the shoulder below it. Mapped by a lowered arm it ends up inside the
+    head. So a sample that comes closer to the canonical body than it was to the posed one, by more than `slack` metres,
+    is mis-warped.
+    """
+    away = (placed.samples.points(rays) - surface.body.vertices[placed.nearest[:, 0]]).norm(dim=-1)
+    rows = canonical.rows_at(placed.x_canonical)
+    near = ((away > slack) & (rows >= 0)).nonzero()[:, 0]
+    _, squared = nearest_listed(canonical, placed.x_canonical[near], rows[near], 1)
+    wrong = torch.zeros(len(away), dtype=torch.bool, device=away.device)
+    wrong[near] = squared[:, 0].sqrt() < away[near] - slack
+    return wrong
+
+
+@torch.no_grad()
+def visible(
+    placed: Placement, rays: int, distance: Distance, beta: Float[Tensor, ""], min_weight: float,
+    grid: SdfGrid | None = None,
+) -> Int[Tensor, "n"]:  # fmt: skip
+    """Which of the samples add more than `min_weight` to their pixel.
+
+    Args:
+        placed: all samples.
+        rays: how many these lie on.
+        distance: of the field, metres.
+        beta: scale of the density, metres.
+        min_weight: a weight (`composite_weights`).
+        grid: of the same field in the same pose; what it shows to be empty or hidden is not queried.
+    """
+    x_canonical = placed.x_canonical
+    queried = torch.arange(len(x_canonical), device=x_canonical.device)
+    if grid is not None:
+        nearer, further = grid.bounds(x_canonical)
+        largest, smallest = laplace_density(nearer, beta), laplace_density(further, beta)
+        queried = possible_samples(placed.samples, smallest, largest, min_weight).nonzero()[:, 0]
+
+    def density(index: Tensor) -> Tensor:
+        return laplace_density(distance(x_canonical[queried[index]]), beta)
+
+    return queried[seen_samples(placed.samples[queried], density, rays, min_weight)]

@@ -1,0 +1,133 @@
+"""The shell sampler: samples near the posed body only, and of these only the ones that can be seen."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from twofold.config import require_within
+from twofold.geometry.cameras import Rays
+from twofold.sampling.joint_box import joint_box
+from twofold.sampling.placement import Deformation, FieldQuery, Placement, placement
+from twofold.sampling.posed_surface import PosedSurface
+from twofold.sampling.pruning import miswarped, visible
+from twofold.sampling.sdf_grid import SdfGrid, tabulate
+from twofold.sampling.shell import Shell, build_shell, nearest_listed, sample_shell
+
+_GRID_PAYS = 150_000
+"""Samples from which on an SDF grid at 15 mm, of some eighty thousand nodes, is the quicker way."""
+
+
+@dataclass(frozen=True)
+class ShellSampler:
+    """Samples near the posed body only, and of these only the ones that can be seen."""
+
+    radius: float = 0.06
+    """How far from the body's vertices samples are placed, metres."""
+    step: float = 0.01
+    """Distance between samples on a ray, metres."""
+    voxel: float = 0.02
+    """Edge of the voxels that list where the shell is, metres."""
+    min_weight: float = 1e-3
+    """Samples that a pass without gradients finds to add less than this to their pixel are discarded; 0 keeps all."""
+    miswarp_slack: float = 0.0
+    """Samples that come closer to the body by more than this when they are mapped to canonical space, metres, are
+    mis-warped and discarded; 0 keeps them. Not for a field that starts as a sphere."""
+    sdf_grid_voxel: float = 0.015
+    """Rendering with dense networks: spacing of a grid of signed distances, queried once a pose, that finds most
+    samples to be empty or hidden before the networks are queried; metres, 0 queries the networks for every sample."""
+
+    def __post_init__(self) -> None:
+        """Refuses sizes that leave nothing to sample."""
+        # The voxels of a body fill half a gigabyte at the smallest edge; a ray crosses it in a thousand steps.
+        require_within(
+            self, radius=(0.005, 0.5), step=(0.001, 0.5), voxel=(0.005, 0.5), min_weight=(0, 1), miswarp_slack=(0, 0.5),
+            sdf_grid_voxel=(0, 0.5),
+        )  # fmt: skip
+        if 0 < self.sdf_grid_voxel < 0.004:
+            raise ValueError(f"sdf_grid_voxel={self.sdf_grid_voxel:g} should be 0.004 to 0.5, or 0 for no grid")
+
+    @property
+    def reach(self) -> float:
+        """How far from the body samples can be, metres."""
+        return self.radius
+
+    def shell(self, body: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], neighbours: int) -> Shell:
+        """The shell around a body, with enough candidates for so many neighbours."""
+        return build_shell(body, faces, self.radius, self.voxel, max(6, 2 * neighbours))
+
+    def ray_box(
+        self, joints: Float[Tensor, "24 3"], given: Callable[[], Float[Tensor, "24 3"]], scale: float
+    ) -> Float[Tensor, "2 3"]:
+        """A box around the posed joints; rays are bounded by the shell instead."""
+        return joint_box(joints)
+
+    def build(
+        self, deformation: Deformation, canonical: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+    ) -> "ShellPlacer":
+        """The sampler of one avatar, around its canonical body."""
+        return ShellPlacer(self, deformation, canonical, faces)
+
+
+class ShellPlacer:
+    """See `ShellSampler`. Keeps the canonical shell, and the SDF grid of the last pose."""
+
+    def __init__(self, config: ShellSampler, deformation: Deformation, canonical: Tensor, faces: Tensor) -> None:
+        """Nothing is built yet."""
+        self.config, self.deformation = config, deformation
+        self._canonical, self._faces = canonical, faces
+        self._canonical_shell: Shell | None = None
+        self._last_grid: tuple[PosedSurface, tuple[int, ...], SdfGrid] | None = None
+
+    def place(
+        self, rays: Rays, surface: PosedSurface, query: FieldQuery, training: bool, generator: torch.Generator | None
+    ) -> Placement:
+        """See `twofold.sampling.placement.Sampler`."""
+        placed = self.candidates(rays, surface, generator)
+        if len(placed.samples) == 0:
+            return placed
+        config = self.config
+        if config.miswarp_slack > 0:
+            shell = self.canonical_shell(surface.forward.device)
+            placed = placed[(~miswarped(placed, rays, surface, shell, config.miswarp_slack)).nonzero()[:, 0]]
+        if config.min_weight > 0:
+            grid = None if training else self._grid(len(placed.samples), surface, query)
+            kept = visible(placed, len(rays), query.distance, query.beta, config.min_weight, grid)
+            placed = placed[kept]
+        return placed
+
+    @torch.no_grad()
+    def candidates(self, rays: Rays, surface: PosedSurface, generator: torch.Generator | None) -> Placement:
+        """Every sample of the rays in the shell; a generator jitters each ray's evenly spaced samples together."""
+        deformation = self.deformation
+        limit = min(self.config.radius, deformation.outlier_distance)
+        samples, nearest, squared = sample_shell(surface.shell, rays, self.config.step, generator, limit)
+        if surface.neighbours > 1 and len(samples):
+            points = samples.points(rays)
+            rows = surface.shell.rows_at(points)
+            nearest, squared = nearest_listed(surface.shell, points, rows, surface.neighbours)
+        outlier = torch.zeros(len(samples), dtype=torch.bool, device=squared.device)
+        return placement(samples, rays, nearest, deformation.weigh(squared), outlier, surface)
+
+    def canonical_shell(self, device: torch.device) -> Shell:
+        """The shell around the canonical body."""
+        if self._canonical_shell is None or self._canonical_shell.vertices.device != device:
+            points, faces = self._canonical.to(device), self._faces.to(device)
+            self._canonical_shell = build_shell(points, faces, self.config.radius, self.config.voxel)
+        return self._canonical_shell
+
+    def _grid(self, samples: int, surface: PosedSurface, query: FieldQuery) -> SdfGrid | None:
+        """The SDF grid of this pose, made as soon as it pays; the last one is kept."""
+        voxel = self.config.sdf_grid_voxel
+        if voxel == 0 or not query.dense:
+            return None
+        if self._last_grid is not None and self._last_grid[0] is surface and self._last_grid[1] == query.version:
+            return self._last_grid[2]
+        if samples < _GRID_PAYS * (0.015 / voxel) ** 3:
+            return None
+        points = self._canonical.to(surface.forward.device)
+        grid = tabulate(query.distance, points, voxel, self.config.radius)
+        self._last_grid = (surface, query.version, grid)
+        return grid
