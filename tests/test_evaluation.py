@@ -36,13 +36,13 @@ def capture(tmp_path):
 def test_what_is_ignored_spoils_no_figure_and_its_share_is_told(capture, monkeypatch):
     def drawn(avatar, capture, frame, refined):
         """The truth, but for what is ignored."""
-        image, mask = evaluate.truth(frame, capture.background)
+        image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         ignored = frame.ignored()
         color, opacity = torch.where(ignored[..., None], 0.3, image), torch.where(ignored, 0.0, mask)
         return Picture(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
 
     monkeypatch.setattr(evaluate, "draw_frame", drawn)
-    avatar = Mock(spec=Avatar)
+    avatar = refined_avatar(())
     figures = evaluate.measure_split(avatar, capture, "novel_pose")
     assert (figures["psnr"], figures["silhouette_iou"]) == (100, 1)
     assert figures["ssim_box"] == pytest.approx(1)
@@ -51,12 +51,14 @@ def test_what_is_ignored_spoils_no_figure_and_its_share_is_told(capture, monkeyp
 
 
 def refined_avatar(parts):
-    return Mock(spec=Avatar, refinement=PoseRefinement(torch.tensor([0]), 2, parts))
+    avatar = Mock(spec=Avatar)
+    avatar.pose_corrections.return_value = PoseRefinement(torch.tensor([0]), 2, parts).change() if parts else {}
+    return avatar
 
 
 def test_what_refined_poses_change_is_told_before_and_after(capture, monkeypatch):
     def drawn(avatar, capture, frame, refined):
-        image, mask = evaluate.truth(frame, capture.background)
+        image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         color, opacity = image * (0.9 if refined else 0.5), mask.clone()
         opacity[:14] *= refined
         return Picture(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
@@ -74,10 +76,14 @@ def test_what_refined_poses_change_is_told_before_and_after(capture, monkeypatch
     assert "poses of the capture" in told["held_out_psnr_box_before"]
 
 
-def test_without_refinement_there_is_no_before_and_after(capture):
-    figures = evaluate.measure_refinement(refined_avatar(()), capture, 8)
-    assert figures.keys() == {"root", "body", "translation", "shape", "protocol"}
-    assert figures["root"] == figures["shape"] == 0
+def test_without_refinement_there_is_no_before_and_after(capture, monkeypatch, tmp_path):
+    def drawn(avatar, capture, frame, refined):
+        image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
+        return Picture(image, mask, depth=mask, normal=image, base=image, base_normal=image)
+
+    monkeypatch.setattr(evaluate, "draw_frame", drawn)
+    assert "pose_refinement" not in evaluate.evaluate(refined_avatar(()), capture, tmp_path)
+    assert "pose_refinement" in evaluate.evaluate(refined_avatar(("root",)), capture, tmp_path)
 
 
 def test_progress_goes_to_the_end_and_no_further(trained, tmp_path):
@@ -97,18 +103,18 @@ def test_by_default_a_long_split_is_sampled_evenly_and_the_protocol_says_so(capt
 
     def drawn(avatar, capture, frame, refined):
         seen.append(frame.time)
-        image, mask = evaluate.truth(frame, capture.background)
+        image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         return Picture(image, mask, depth=mask, normal=image, base=image, base_normal=image)
 
     monkeypatch.setattr(evaluate, "draw_frame", drawn)
     frame = capture.splits["novel_pose"][1]
     long = replace(capture, splits={**capture.splits, "novel_pose": tuple(replace(frame, time=t) for t in range(300))})
-    metrics = evaluate.evaluate(Mock(spec=Avatar), long, tmp_path)
+    metrics = evaluate.evaluate(refined_avatar(()), long, tmp_path)
     held_out = seen[:-1]
     assert (len(held_out), held_out[0], held_out[-1]) == (30, 0, 299)
     assert set(np.diff(held_out)) <= {10, 11}
     assert metrics["novel_pose"]["protocol"]["frames"].startswith("mean over 30 of 300 images, evenly spread, of the")
     assert metrics["train"]["protocol"]["frames"].startswith("mean over all 1 images of the split train")
     seen.clear()
-    evaluate.evaluate(Mock(spec=Avatar), long, tmp_path, most=None)
+    evaluate.evaluate(refined_avatar(()), long, tmp_path, most=None)
     assert len(seen) == 301

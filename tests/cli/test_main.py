@@ -284,7 +284,7 @@ def test_perceptual_weights_shape_the_training_but_are_not_stored_with_it(
     notes = {name: json.loads((tmp_path / name / "run.json").read_text())["notes"] for name in ("with", "without")}
     assert notes["with"] == ["LPIPS is part of the loss."]
     assert "LPIPS is left out" in notes["without"][0]
-    (first, _), (second, _) = (read_checkpoint(tmp_path / name) for name in ("with", "without"))
+    (first, *_), (second, *_) = (read_checkpoint(tmp_path / name) for name in ("with", "without"))
     assert {name: tensor.shape for name, tensor in first.items()} == {n: t.shape for n, t in second.items()}
     columns = {name: (tmp_path / name / "curves.csv").read_text().split()[0].split(",") for name in notes}
     assert set(columns["with"]) - set(columns["without"]) == {"lpips"}

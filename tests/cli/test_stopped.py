@@ -31,7 +31,7 @@ def test_ctrl_c_stores_the_state_and_says_how_to_go_on_to_the_same_numbers(
     main(shlex.split(said.partition(" with: twofold ")[2]))
     on_preview(monkeypatch, lambda step: None)
     main(["train", str(person_folder), "--out", str(tmp_path / "whole"), *set_small(7), "--device", "cpu"])
-    (first, _), (second, _) = (read_checkpoint(folder) for folder in (run, tmp_path / "whole"))
+    (first, *_), (second, *_) = (read_checkpoint(folder) for folder in (run, tmp_path / "whole"))
     assert first.keys() == second.keys()
     assert all(torch.equal(tensor, second[name]) for name, tensor in first.items())
 

@@ -100,7 +100,7 @@ def test_a_team_stops_together_when_one_is_asked_to_and_goes_on_together(person:
     time.sleep(1)
     team[1].send_signal(signal.SIGINT)
     assert [code for code, _ in ended(team)] == [130, 130]
-    _, stopped = read_checkpoint(tmp_path / "run")
+    _, stopped, _ = read_checkpoint(tmp_path / "run")
     assert 0 < stopped < 400
     shorter = replace(recipe, training=replace(recipe.training, steps=stopped + 2))
     assert [code for code, _ in ended(together(person, shorter, tmp_path / "run"))] == [0, 0]

@@ -84,7 +84,7 @@ def test_loaded_avatar_has_the_stored_state_and_does_not_train(begun):
 
 
 def test_optimizer_continues_with_the_stored_moments(begun, subject):
-    tensors, _ = read_checkpoint(begun)
+    tensors, *_ = read_checkpoint(begun)
     optimizer = make_optimizer(RECIPE.method.build(subject, 1), RECIPE.training)
     load_optimizer(optimizer, tensors)
     state = optimizer.state_dict()["state"]
@@ -184,7 +184,7 @@ def test_checkpoint_without_its_step_is_damaged(run):
 
 
 def test_moments_of_other_parameters_do_not_fit_the_optimizer(begun, subject):
-    tensors, _ = read_checkpoint(begun)
+    tensors, *_ = read_checkpoint(begun)
     optimizer = make_optimizer(RECIPE.method.build(subject, 1), RECIPE.training)
     with pytest.raises(TwofoldError, match=r"optimizer\.0\.exp_avg"):
         load_optimizer(optimizer, tensors | {"optimizer.0.exp_avg": torch.zeros(2)})

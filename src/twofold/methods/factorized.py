@@ -33,7 +33,7 @@ from twofold.methods.base import (
     PosedAvatar,
     Rendering,
 )
-from twofold.methods.factorized_config import RateConfig
+from twofold.methods.factorized_config import FactorizedPose, RateConfig
 from twofold.methods.loss_terms import loss_terms
 from twofold.methods.pose_schedule import PoseConfig, condition
 from twofold.methods.subject import Subject
@@ -98,21 +98,6 @@ class FactorizedConfig(MethodConfig):
     def build(self, subject: Subject, seed: int = 0) -> "FactorizedAvatar":
         """An untrained avatar of a subject."""
         return FactorizedAvatar(self, subject, seed)
-
-
-@dataclass(frozen=True)
-class FactorizedPose:
-    """What the method derives from a pose.
-
-    Attributes:
-        surface: the posed body with its shell.
-        condition: the pose vector that the pose-dependent branch is conditioned on.
-        anchors: canonical vertices that turn normals, where these are not the ones that inverse skinning found.
-    """
-
-    surface: PosedSurface
-    condition: Float[Tensor, "P"]
-    anchors: Float[Tensor, "V 3"] | None = None
 
 
 Posed = PosedAvatar[FactorizedPose]
