@@ -28,14 +28,14 @@ def around(count, spread, generator):
 @pytest.mark.parametrize(("field", "least", "most"), [(sphere, 0.0, 0.004), (rippled, 0.003, 0.04)])
 def test_the_field_lies_between_the_bounds(field, least, most, device, generator):
     table = tabulate(lambda x: field(x.cpu()).to(device), POINTS.to(device), 0.02, 0.06)
-    assert least < table.doubt < most
+    assert least < table.error < most
     x = around(20_000, 0.02, generator)
     nearer, further = (bound.cpu() for bound in table.bounds(x.to(device)))
     between = (nearer <= field(x)) & (field(x) <= further)
     assert between.float().mean() > 0.999
     known = nearer.isfinite()
     assert known.float().mean() > 0.95
-    torch.testing.assert_close((further - nearer)[known], torch.full((int(known.sum()),), 2 * table.doubt))
+    torch.testing.assert_close((further - nearer)[known], torch.full((int(known.sum()),), 2 * table.error))
 
 
 def test_away_from_the_lattice_nothing_is_known():

@@ -302,7 +302,7 @@ def test_a_checkpoint_that_lost_a_tensor_is_damaged(run):
 
 
 def test_moments_that_are_not_all_there_do_not_continue(begun, subject):
-    tensors, _ = read_checkpoint(begun)
+    tensors, *_ = read_checkpoint(begun)
     optimizer = make_optimizer(RECIPE.method.build(subject, 1), RECIPE.training)
     for wrong in ("optimizer.0.exp_avg_sq", "optimizer.0.step"):
         with pytest.raises(TwofoldError, match=f"lacks {wrong}"):
