@@ -28,8 +28,8 @@ from twofold.capture.types import Capture
 from twofold.evaluation import measure_split
 from twofold.kernels.runtime import tune_process
 from twofold.methods.base import Avatar
-from twofold.methods.subject import Subject
 from twofold.methods.factorized_recipes import fast, quick
+from twofold.methods.subject import Subject
 from twofold.outputs.views import draw
 from twofold.recipe import Recipe
 from twofold.training.loop import Progress, train
