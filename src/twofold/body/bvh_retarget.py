@@ -1,9 +1,15 @@
 """From the skeleton of a BVH file to a body: rest poses aligned, sizes matched, standing feet kept.
 
-For each joint the rotation since a reference pose is taken, R = A G G_ref^-1 B^-1 S: G and G_ref are the joint's world
-rotations in the frame and in the reference pose, A and B turn the file's world and the reference pose upright (y up,
-facing +z), and S turns the body's own rest bone onto the reference pose's bone, so that limbs point in the end exactly
-where the file's limbs point. The reference is frame 0 where that is a T-pose, else the pose of all zeros.
+For each joint the rotation since a reference pose is taken,
+
+$$
+R_j = A G_j G_{j,ref}^{-1} B^{-1} S_j
+$$
+
+where G are the joint's world rotations in the frame and in the reference pose, A and B turn the file's world and the
+reference pose upright (y up, facing +z), and S turns the body's own rest bone onto the reference pose's bone, so that
+limbs point exactly where the file's limbs point. The reference is frame 0 where that is a T-pose, else the pose of all
+zeros.
 
 Some skeletons have no meaningful zero pose (all bones of LaFAN1 lie along x). There each limb joint's rest frame is
 taken from its bone and from the motion itself: knees and elbows bend about one axis, feet stand flat.

@@ -1,4 +1,4 @@
-"""How far a person's joints turn: a check, and a clamp, for poses that are made up."""
+"""How far a person's joints turn: a check, and a clamp, for generated poses."""
 
 import torch
 from jaxtyping import Float

@@ -39,7 +39,7 @@ class MotionOptions:
 
 @dataclass(frozen=True)
 class MotionRead:
-    """A motion of the body that it was asked for (y up), and what was found in its file.
+    """A motion of the requested body (y up), and what was found in its file.
 
     Attributes:
         motion: ready to be played.

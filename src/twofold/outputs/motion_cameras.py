@@ -20,7 +20,7 @@ _THICK = 0.18
 """How far a body reaches around an inner joint at most, metres."""
 
 _FOCAL = 1.9
-"""Focal length in picture heights: a field of view of 29 degrees, as a portrait has."""
+"""Focal length in image heights: a field of view of 29 degrees, as a portrait has."""
 
 _FILLED = 0.92
 """Share of the image that the person may take up."""
