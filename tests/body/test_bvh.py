@@ -43,8 +43,9 @@ def saved(tmp_path, text):
 @pytest.mark.parametrize("units", ["m", "cm"])
 def test_what_is_written_is_read_back(tmp_path, units):
     motion = random_motion(1, 5, 24.0)
-    motion.poses[0, 4] = torch.tensor([np.pi / 2, 0, 0])  # where the angles of Rz Rx Ry are not unique
-    motion.poses[1, 4] = torch.tensor([-np.pi / 2, 0, 0])
+    for frame, quarter in enumerate((90, -90)):  # where the angles of Rz Rx Ry are not unique
+        turned = Rotation.from_euler("ZXY", [40, quarter, 25], degrees=True)
+        motion.poses[frame, 4] = torch.from_numpy(turned.as_rotvec())
     motion.poses[2] = 0
     path = tmp_path / "own.bvh"
     write_bvh(path, JOINTS, motion, units=units)

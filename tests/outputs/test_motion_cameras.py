@@ -35,6 +35,14 @@ def test_a_camera_that_does_not_follow_stands_still():
     assert all(torch.equal(camera.world_to_camera, cameras[0].world_to_camera) for camera in cameras)
 
 
+def test_a_camera_that_stands_still_has_the_motion_in_its_middle():
+    motion = MOTIONS["walk"]
+    cameras = motion_cameras(BODY, motion, 100)
+    posed = [pose_body(BODY, *frame).vertices for frame in zip(motion.poses, motion.translations, strict=True)]
+    pixels = torch.cat([project(cameras[0], vertices)[0] for vertices in posed[::5]])
+    assert ((pixels.amax(0) + pixels.amin(0)) / 2 - 49.5).abs().max() < 6
+
+
 def test_a_camera_that_follows_keeps_its_direction_and_moves_smoothly():
     cameras = motion_cameras(BODY, MOTIONS["walk"], 64, follow=True)
     centers = torch.stack([camera.center for camera in cameras])

@@ -65,13 +65,16 @@ def motion_cameras(
     else:
         centers = ((low.amin(0) + high.amax(0)) / 2).expand(len(motion), 3)
     points = (positions - centers[:, None]) @ view.T
-    if not follow:  # The middle of what is seen, which is nearer to the camera on one side.
-        wide = around[:, None]
-        shift = ((points[..., :2] + wide).amax((0, 1)) + (points[..., :2] - wide).amin((0, 1))) / 2
-        moved = shift @ view[:2]
-        centers, points = centers + moved, points - torch.cat([shift, torch.zeros(1).to(shift)])
-    slope = _FILLED * 0.5 / _FOCAL
-    away = float(((points[..., :2].abs() + around[:, None]) / slope - points[..., 2:]).max())
+    slope, wide = _FILLED * 0.5 / _FOCAL, around[:, None]
+    away = _distance(points, wide, slope)
+    if not follow:
+        # To the middle of what is seen; what is nearer is seen larger, so the distance counts.
+        for _ in range(8):
+            depth = points[..., 2:] + away
+            ends = torch.stack([((points[..., :2] + sign * wide) / depth) for sign in (-1, 1)]).flatten(0, 2)
+            shift = torch.cat([(ends.amax(0) + ends.amin(0)) / 2 * away, torch.zeros(1, dtype=torch.float64)])
+            centers, points = centers + shift @ view, points - shift
+            away = _distance(points, wide, slope)
     focal = _FOCAL * size
     intrinsics = torch.tensor([[focal, 0.0, (size - 1) / 2], [0.0, focal, (size - 1) / 2], [0.0, 0.0, 1.0]])
     cameras: list[Camera] = []
@@ -80,6 +83,11 @@ def motion_cameras(
         transform[:3, :3], transform[:3, 3] = view, -view @ (center + away * toward)
         cameras.append(Camera(transform.float(), intrinsics, size, size))
     return cameras
+
+
+def _distance(points: Float[Tensor, "T 24 3"], around: Float[Tensor, "24 1"], slope: float) -> float:
+    """From where balls around points (relative to the middle, in the camera's axes) fit into its field of view."""
+    return float(((points[..., :2].abs() + around) / slope - points[..., 2:]).max())
 
 
 def _smoothed(path: Float[Tensor, "T 3"], deviation: float) -> Float[Tensor, "T 3"]:
