@@ -90,6 +90,8 @@ def test_formats_that_are_not_read_are_refused_unopened_with_advice(tmp_path, na
 def test_what_is_neither_a_file_nor_a_name_is_said(tmp_path):
     with pytest.raises(TwofoldError, match=r"neither a file nor a built-in motion.*walk, turn, dance"):
         read_motion("wlak", BODY)
+    with pytest.raises(TwofoldError, match="neither a file"):
+        read_motion("walk" * 2000, BODY)
     with pytest.raises(TwofoldError, match="is a folder"):
         read_motion(tmp_path, BODY)
 

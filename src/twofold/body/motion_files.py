@@ -16,6 +16,7 @@ from twofold.body.motion import Motion, as_single, resampled, started_at_origin
 from twofold.body.skeleton import Body, ShapedBody
 from twofold.body.smpl_motions import LAYOUTS, read_smpl_motion
 from twofold.errors import TwofoldError
+from twofold.inputs import is_there, shown_path
 
 __all__ = ["LAYOUTS", "READERS", "MotionOptions", "MotionRead", "read_motion"]
 
@@ -143,7 +144,7 @@ def read_motion(
     """
     options = options or MotionOptions()
     path, name = Path(source), str(source)
-    if name in BUILTIN_MOTIONS and not path.is_file():
+    if name in BUILTIN_MOTIONS and not _is_file(path):
         made = as_single(BUILTIN_MOTIONS[name](body))
         read = MotionRead(made, f"built-in motion {name!r}", len(made), made.fps, "y", "metres")
     else:
@@ -160,14 +161,18 @@ def read_motion(
 
 def _reader(path: Path) -> Callable[[Path, ShapedBody, Body | None, MotionOptions], MotionRead]:
     ending = path.suffix.lower()
-    if ending in READERS and path.is_file():
+    if ending in READERS and _is_file(path):
         return READERS[ending]
     known = ", ".join(BUILTIN_MOTIONS)
-    if path.is_dir() or not path.exists():
-        what = "is a folder" if path.is_dir() else "is neither a file nor a built-in motion"
-        raise TwofoldError(f"{path} {what}; name a {' or '.join(READERS)} file, or one of {known}.")
+    if not is_there(path) or path.is_dir():
+        what = "is a folder" if is_there(path) else "is neither a file nor a built-in motion"
+        raise TwofoldError(f"{shown_path(path)} {what}; name a {' or '.join(READERS)} file, or one of {known}.")
     reason = _REFUSED.get(ending, "is of a format that is not read")
     advice = (
         "convert it to BVH, in Blender say" if ending in (".fbx", ".glb", ".gltf", ".amc", ".c3d", ".usd") else _ADVICE
     )
     raise TwofoldError(f"{path} {reason}, expected {' or '.join(READERS)}; {advice}.")
+
+
+def _is_file(path: Path) -> bool:
+    return is_there(path) and path.is_file()

@@ -161,10 +161,12 @@ def render(
     within(size=(size, 16, 4096), chunk=(chunk, 1, None))
     require_run(run)
     if motion_video.motion is not None:
-        render_motion(run, motion_video, size, out, chunk, device)
+        render_motion(run, motion_video, size, out, chunk, device, capture)
         return
     if motion_video != NO_MOTION:
-        raise TwofoldError("--follow, --fps, --up, --units, --start-at-origin, --background and --alpha need --motion.")
+        raise TwofoldError(
+            "--mesh, --follow, --fps, --up, --units, --start-at-origin, --background and --alpha need --motion."
+        )
     avatar, _ = load(run, choose_device(device))
     source = find_capture(run, capture)
     require_capture(source)

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from twofold.cli.advice import require_capture
 from twofold.cli.console import bar, console, say, within
 
 
@@ -15,6 +16,8 @@ class MotionView:
 
     motion: str | None = None
     """Renders a motion instead: a .bvh or .npz file (AMASS, SMPL, AIST++), or walk, turn, dance, range-of-motion."""
+    mesh: bool = False
+    """Renders the baked mesh instead of the field: quick, after half a minute of baking."""
     follow: bool = False
     """The camera goes along; otherwise it stands where it sees the whole motion."""
     fps: float | None = None
@@ -85,9 +88,12 @@ def motion(
     say(f"The preview is {path}.", f"twofold render RUN --motion {source}")
 
 
-def render_motion(run: Path, shown: MotionView, size: int, out: Path | None, chunk: int | None, device: str) -> None:
+def render_motion(
+    run: Path, shown: MotionView, size: int, out: Path | None, chunk: int | None, device: str, capture: Path | None
+) -> None:
     """Renders an avatar in a motion; see `twofold render`."""
     from twofold.body.motion_files import MotionOptions, read_motion
+    from twofold.capture.folder import read_capture
     from twofold.outputs.motion_cameras import motion_cameras
     from twofold.outputs.motion_video import (
         VIDEO_ENDINGS,
@@ -97,7 +103,7 @@ def render_motion(run: Path, shown: MotionView, size: int, out: Path | None, chu
         rest_body,
         write_motion,
     )
-    from twofold.training.run import choose_device, load, read_subject
+    from twofold.training.run import choose_device, find_capture, load, read_subject, require_same
 
     name = Path(str(shown.motion)).stem
     default = run / "renders" / (f"motion-{name}" if shown.alpha else f"motion-{name}.mp4")
@@ -113,9 +119,19 @@ def render_motion(run: Path, shown: MotionView, size: int, out: Path | None, chu
     for line in read.lines():
         console().print(line, soft_wrap=True)
     cameras = motion_cameras(body, read.motion, size, shown.follow)
-    renderer = field_renderer(avatar, read.motion, chunk)
+    if shown.mesh:
+        from twofold.outputs.mesh_motion import mesh_renderer
+
+        folder = find_capture(run, capture)
+        require_capture(folder)
+        trained_on = read_capture(folder)
+        require_same(run, trained_on, motion=True)
+        with bar("Baking") as progress:
+            renderer = mesh_renderer(avatar, trained_on, read.motion, progress=progress)
+    else:
+        renderer = field_renderer(avatar, read.motion, chunk)
     with bar("Rendering") as show:
         write_motion(
             path, read.motion.fps, cameras, renderer, color, shown.alpha, lambda done: show(done, ""), path == default
         )
-    say(f"The motion is in {path}.", f"twofold motion {shown.motion}")
+    say(f"The motion is in {path}.", f"twofold export {run} --motion {shown.motion}")

@@ -13,8 +13,9 @@ from torch import Tensor
 from twofold.body.motion import Motion
 from twofold.body.skeleton import ShapedBody, pose_body
 from twofold.errors import TwofoldError
-from twofold.files import new_folder
+from twofold.files import made_folder, new_folder
 from twofold.geometry.cameras import Camera
+from twofold.inputs import is_there
 from twofold.methods.base import Avatar
 from twofold.outputs.mesh_images import floor_image, mesh_image
 from twofold.outputs.video import write_alpha_video, write_video
@@ -111,7 +112,7 @@ def require_video_path(path: Path, alpha: bool) -> None:
         raise TwofoldError(f"--out should end in {', '.join(VIDEO_ENDINGS)} or be a folder for images, it is {path}.")
     if alpha and ending == ".mp4":
         raise TwofoldError("An MP4 holds no opacity; with --alpha let --out end in .webm or .mov, or name a folder.")
-    if path.exists() and path.is_dir() == bool(ending):
+    if is_there(path) and path.is_dir() == bool(ending):
         what = "a folder" if ending else "a file"
         raise TwofoldError(f"{path} exists and is {what}; choose another --out.")
 
@@ -150,9 +151,8 @@ def write_motion(
             progress((index + 1) / len(cameras))
 
     if path.suffix:
-        if path.parent != path:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        (write_alpha_video if alpha else write_video)(path, views(), fps)
+        with made_folder(path.parent):
+            (write_alpha_video if alpha else write_video)(path, views(), fps)
         return
     with new_folder(path, replace) as folder:
         for index, image in enumerate(views()):
