@@ -60,6 +60,7 @@ def rest_body(avatar: Avatar) -> ShapedBody:
 def field_renderer(avatar: Avatar, motion: Motion, chunk: int | None = None) -> Renderer:
     """Renders the avatar's field: the best image, the slowest."""
 
+    @torch.no_grad()
     def view(index: int, camera: Camera) -> View:
         posed = avatar.pose(motion.poses[index], motion.translations[index])
         image = draw(avatar, posed, camera, torch.zeros(3), chunk)
