@@ -26,7 +26,8 @@ LIMIT = 50_000_000
 WHEELS = (
     "tyro", "docstring-parser", "typeguard", "typing-extensions", "rich", "markdown-it-py", "mdurl", "pygments",
     "jaxtyping", "wadler-lindig", "safetensors", "jinja2", "markupsafe", "beartype", "pytest", "pluggy", "iniconfig",
-    "hypothesis", "sortedcontainers", "tensorboard", "protobuf", "absl-py", "packaging", "scikit-image", "lazy-loader", "tifffile", "imageio", "av",
+    "hypothesis", "sortedcontainers", "tensorboard", "protobuf", "absl-py", "packaging",
+    "scikit-image", "lazy-loader", "tifffile", "imageio", "av",
 )  # fmt: skip
 """From the most needed to what can be done without: a wheel that would break the limit is left out."""
 PLATFORMS = tuple(f"manylinux{version}_x86_64" for version in ("_2_28", "_2_27", "_2_17", "2014", "2010", "1"))
