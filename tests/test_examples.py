@@ -27,3 +27,28 @@ def test_example_prints_what_it_says(module, text):
     result = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(example, out=printed.append)
     assert result.attempted > 0
     assert result.failed == 0, "".join(printed)
+
+
+CORE = ("volume", "deform", "field", "sampling")
+INCOMPLETE = {
+    "twofold.field.networks.bf16_is_fast": "asks the machine",
+    "twofold.field.bone_boxes.initial_half_sizes": "a list of proportions",
+    "twofold.field.point_features.nearest_posed_points": "a search among a trained cloud's points",
+    "twofold.field.points.choose_positions": "needs a surface around every part",
+    "twofold.field.prefit.distance_pool": "draws points",
+    "twofold.field.prefit.fit_distance": "takes minutes",
+}
+"""Public functions of the core without a formula or without an example, and why."""
+
+
+def test_public_functions_of_the_core_have_a_formula_and_a_worked_example():
+    lacking = []
+    for module, file in citations.modules().items():
+        if module.split(".")[1:2] not in [[package] for package in CORE] or "kernels" in module:
+            continue
+        for node in ast.parse(file.read_text()).body:
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+                text = ast.get_docstring(node) or ""
+                if ">>>" not in text or not ("\\[" in text or "$" in text):
+                    lacking.append(f"{module}.{node.name}")
+    assert set(lacking) == set(INCOMPLETE)

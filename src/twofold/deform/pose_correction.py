@@ -17,7 +17,9 @@ ANGLE_OFFSET = 1e-5
 
 
 def body_pose_condition(pose: Float[Tensor, "24 3"]) -> Float[Tensor, "69"]:
-    """What the networks are conditioned on: the 23 body rotations without the root, radians, plus 0.01.
+    r"""What the networks are conditioned on: the 23 body rotations without the root, radians, plus 0.01.
+
+    \[ \hat\theta = (\theta_1, \dots, \theta_{23}) + 0.01 \]
 
     >>> body_pose_condition(torch.zeros(24, 3))[:2]
     tensor([0.0100, 0.0100])
@@ -26,7 +28,9 @@ def body_pose_condition(pose: Float[Tensor, "24 3"]) -> Float[Tensor, "69"]:
 
 
 def correction_matrix(axis_angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Rodrigues' formula I + sin(a) K + (1 - cos a) K^2 with a = sqrt(1e-5 + |r|^2) and K the cross matrix of r / a.
+    r"""Rodrigues' formula I + sin(a) K + (1 - cos a) K^2 with a = sqrt(1e-5 + |r|^2) and K the cross matrix of r / a.
+
+    \[ R = I + \sin(a) K + (1 - \cos a) K^2, \quad a = \sqrt{10^{-5} + \lVert r \rVert^2}, \quad K = [r / a]_\times \]
 
     The axis r / a is shorter than one for small r, so the result is a rotation only up to about 1e-5, as in the
     authors' programs; `geometry.rotations.axis_angle_to_matrix` is the exact form.

@@ -57,7 +57,9 @@ class CanonicalBox:
 
 
 def canonical_box(joints: Float[Tensor, "24 3"], margin: float = MARGIN) -> CanonicalBox:
-    """The box of the T-pose joints, `margin` metres larger on every side.
+    r"""The box of the T-pose joints, `margin` metres larger on every side.
+
+    \[ [\min_j J_j - m, \; \max_j J_j + m] \]
 
     >>> canonical_box(torch.zeros(24, 3))
     CanonicalBox(low=tensor([-0.3000, -0.3000, -0.3000]), high=tensor([0.3000, 0.3000, 0.3000]))
@@ -66,7 +68,17 @@ def canonical_box(joints: Float[Tensor, "24 3"], margin: float = MARGIN) -> Cano
 
 
 def bone_prior(joints: Float[Tensor, "24 3"], box: CanonicalBox, size: int = 32) -> Float[Tensor, "25 z y x"]:
-    """Where each bone is expected: Gaussians around the bones of a skeleton, background last; sums to one.
+    r"""Where each bone is expected: Gaussians around the bones of a skeleton, background last; sums to one.
+
+    \[ W_b \propto \sum_c e^{-(a_c / 0.12)^2 - (r_c / 0.06)^2},
+    \qquad W_{bg} \propto 1 - \mathrm{clamp}\Big(\sum_b W_b, 0, 1\Big) \]
+
+    with the distances $a_c$ along and $r_c$ across the bone to the child $c$.
+
+    >>> joints = torch.rand(24, 3, generator=torch.Generator().manual_seed(0))
+    >>> prior = bone_prior(joints, canonical_box(joints), size=4)
+    >>> prior.shape, bool(torch.allclose(prior.sum(0), torch.ones(4, 4, 4)))
+    (torch.Size([25, 4, 4, 4]), True)
 
     A joint's channel is the sum over its child bones of exp(-(a / 0.12)^2 - (c / 0.06)^2), with a and c the distances
     from the bone's midpoint along and across the bone, metres (c is over 0.09 in the torso). This is the quadratic form
@@ -234,7 +246,15 @@ def skeletal_backward(
     box: CanonicalBox,
     min_likelihood: float | None = None,
 ) -> SkeletalPoints:
-    """Points of observation space in canonical space: x_skel = sum_i w_i M_i x / max(sum_i w_i, 1e-4).
+    r"""Points of observation space in canonical space: x_skel = sum_i w_i M_i x / max(sum_i w_i, 1e-4).
+
+    \[ x_{skel} = \frac{\sum_i w_i M_i x}{\max(\sum_i w_i, 10^{-4})}, \qquad w_i = W_i(M_i x) \]
+
+    >>> box = CanonicalBox(-torch.ones(3), torch.ones(3))
+    >>> moves = torch.eye(4).repeat(24, 1, 1)
+    >>> moves[:, 0, 3] = -0.5  # every bone takes points half a metre to the left
+    >>> skeletal_backward(torch.full((24, 2, 2, 2), 1 / 24), torch.tensor([[0.75, 0.0, 0.0]]), moves, box).points
+    tensor([[0.2500, 0.0000, 0.0000]])
 
     w_i = W_i(M_i x) is bone i's weight where that bone takes the point, zero outside the box; f = sum_i w_i
     (HumanNeRF Eqs. 3-5). One batched lookup serves all bones, and the transforms are blended before they are applied:
@@ -266,7 +286,15 @@ def skeletal_forward(
     from_canonical: Float[Tensor, "24 4 4"],
     box: CanonicalBox,
 ) -> Float[Tensor, "S 3"]:
-    """Canonical points in a pose: x = sum_i W_i(x_c) M_i^-1 x_c / max(sum_i W_i(x_c), 1e-4) (MonoHuman Eq. 5).
+    r"""Canonical points in a pose: x = sum_i W_i(x_c) M_i^-1 x_c / max(sum_i W_i(x_c), 1e-4) (MonoHuman Eq. 5).
+
+    \[ x = \frac{\sum_i W_i(x_c) M_i^{-1} x_c}{\max(\sum_i W_i(x_c), 10^{-4})} \]
+
+    >>> box = CanonicalBox(-torch.ones(3), torch.ones(3))
+    >>> moves = torch.eye(4).repeat(24, 1, 1)
+    >>> moves[:, 0, 3] = 0.5
+    >>> skeletal_forward(torch.full((24, 2, 2, 2), 1 / 24), torch.tensor([[0.25, 0.0, 0.0]]), moves, box)
+    tensor([[0.7500, 0.0000, 0.0000]])
 
     All weights are looked up at the point itself.
 

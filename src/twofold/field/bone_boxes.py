@@ -59,7 +59,16 @@ class BoneFrames:
 
 
 def bone_frames(joints: Float[Tensor, "24 3"]) -> BoneFrames:
-    """The bone-aligned frames of a skeleton whose rest joints (metres) are given."""
+    r"""The bone-aligned frames of a skeleton whose rest joints (metres) are given.
+
+    \[ x_{frame} = R_j (x - o_j), \qquad o_j = \tfrac12 (J_j + J_{child}), \qquad R_j (J_{child} - J_j) \parallel e_z \]
+
+    >>> joints = torch.rand(24, 3, generator=torch.Generator().manual_seed(0))
+    >>> frames = bone_frames(joints)
+    >>> bone = frames.rotations[18] @ (joints[20] - joints[18])  # the left elbow has one child, the wrist
+    >>> bool(bone[:2].abs().max() < 1e-6), bool(torch.equal(frames.origins[18], (joints[18] + joints[20]) / 2))
+    (True, True)
+    """
     rotations, origins = [], []
     for joint in range(24):
         children = _children(joint)
@@ -73,7 +82,12 @@ def bone_frames(joints: Float[Tensor, "24 3"]) -> BoneFrames:
 
 
 def initial_half_sizes(joints: Float[Tensor, "24 3"]) -> Float[Tensor, "24 3"]:
-    """Half-sizes (x, y, z) of the boxes in their frames, from the proportions of the skeleton, metres.
+    r"""Half-sizes (x, y, z) of the boxes in their frames, from the proportions of the skeleton, metres.
+
+    >>> joints = torch.zeros(24, 3)
+    >>> joints[4, 0], joints[5, 0], joints[7, 0], joints[7, 1] = 0.2, -0.2, 0.2, -1.0
+    >>> initial_half_sizes(joints)[4]  # left knee: half the distance of the knees, and 4/5 of the shin
+    tensor([0.2000, 0.2000, 0.8000])
 
     With k the distance of the knees and s that of the shoulders, x = y = k/2 for legs, s/2 for the torso, 2k/5 for
     collars, arms and hands. z is 4/5 of the bone to the child (the mean of several), and the length of the parent's
@@ -115,7 +129,11 @@ class BoxSizes(nn.Module):
 def box_coordinates(
     points: Float[Tensor, "S 3"], world_to_frame: Float[Tensor, "J 4 4"], half_sizes: Float[Tensor, "J 3"]
 ) -> Float[Tensor, "S J 3"]:
-    """Coordinates of points in every box.
+    r"""Coordinates of points in every box.
+
+    \[ u_j = S_j^{-1} M_j x \]
+
+    with the transform $M_j$ into the frame of box $j$ and its half-sizes on the diagonal of $S_j$.
 
     >>> box_coordinates(torch.tensor([[1.0, 2.0, 3.0]]), torch.eye(4)[None], torch.tensor([[1.0, 2.0, 4.0]]))
     tensor([[[1.0000, 1.0000, 0.7500]]])
@@ -132,12 +150,20 @@ def box_coordinates(
 
 
 def inside_boxes(coordinates: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-    """Whether all three box coordinates lie in -1..1."""
+    r"""Whether all three box coordinates lie in -1..1.
+
+    \[ \max_i |u_i| \le 1 \]
+
+    >>> inside_boxes(torch.tensor([[0.0, -1.0, 0.5], [0.0, 1.1, 0.0]]))
+    tensor([ True, False])
+    """
     return (coordinates.abs() <= 1).all(-1)
 
 
 def box_window(coordinates: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """exp(-2 (x^6 + y^6 + z^6)): one in the middle of a box, 0.14 at the middle of a face, nothing outside.
+    r"""exp(-2 (x^6 + y^6 + z^6)): one in the middle of a box, 0.14 at the middle of a face, nothing outside.
+
+    \[ w = e^{-2 (u_x^6 + u_y^6 + u_z^6)} \]
 
     >>> box_window(torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
     tensor([1.0000, 0.1353])
@@ -149,7 +175,9 @@ def box_window(coordinates: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
 def assign_to_boxes(
     coordinates: Float[Tensor, "S J 3"], half_sizes: Float[Tensor, "J 3"], tries: int = 5
 ) -> Int[Tensor, "S"]:
-    """The box that each point belongs to: of the `tries` with the nearest centres, the nearest that holds it; else -1.
+    r"""The box that each point belongs to: of the `tries` with the nearest centres, the nearest that holds it; else -1.
+
+    \[ j = \arg\min_{j : \max_i |u_{ji}| \le 1} \lVert S_j u_j \rVert \]
 
     >>> assign_to_boxes(torch.tensor([[[2.0, 0.0, 0.0], [0.9, 0.0, 0.0]]]), torch.tensor([[0.1] * 3, [1.0] * 3]))
     tensor([1])

@@ -18,7 +18,13 @@ _NEIGHBOUR_MEAN, _NEIGHBOUR_SPREAD, _MIN_NEIGHBOUR = 0.05, 0.05, 0.01
 
 
 def skeleton_adjacency() -> Float[Tensor, "24 24"]:
-    """One where two joints are the same or joined by a bone, zero elsewhere."""
+    r"""One where two joints are the same or joined by a bone, zero elsewhere.
+
+    \[ A_{ij} = 1 \text{ where } i = j \text{ or a bone joins them, else } 0 \]
+
+    >>> skeleton_adjacency()[0].nonzero()[:, 0]  # the pelvis, both hips and the spine
+    tensor([0, 1, 2, 3])
+    """
     adjacency = torch.eye(24)
     for child, parent in enumerate(PARENTS):
         if parent >= 0:
@@ -27,7 +33,9 @@ def skeleton_adjacency() -> Float[Tensor, "24 24"]:
 
 
 def rotation_features(rotations: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6"]:
-    """The first two columns of rotation matrices, row by row ("rot6d").
+    r"""The first two columns of rotation matrices, row by row ("rot6d").
+
+    \[ (R_{11}, R_{12}, R_{21}, R_{22}, R_{31}, R_{32}) \]
 
     >>> rotation_features(torch.arange(9.0).reshape(3, 3))
     tensor([0., 1., 3., 4., 6., 7.])
@@ -36,7 +44,13 @@ def rotation_features(rotations: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6
 
 
 def pose_features(rotations: Float[Tensor, "*b 24 3 3"], octaves: int) -> Float[Tensor, "*b 24 f"]:
-    """What a pose graph sees of each joint: `rotation_features` and their sines and cosines; zeros for the root.
+    r"""What a pose graph sees of each joint: `rotation_features` and their sines and cosines; zeros for the root.
+
+    \[ f_j = \gamma_L(R_{j11}, R_{j12}, \dots, R_{j32}), \qquad f_0 = 0 \]
+
+    >>> features = pose_features(torch.eye(3).expand(24, 3, 3), octaves=0)
+    >>> features[0].tolist(), features[1].tolist()
+    ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
 
     Args:
         rotations: local rotations of the pose.

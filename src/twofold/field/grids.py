@@ -99,7 +99,9 @@ def corners(x: Float[Tensor, "S 3"], lattices: Lattices, level: int) -> tuple[In
 def interpolate_in_torch(
     table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], lattices: Lattices
 ) -> Float[Tensor, "S LC"]:
-    """`interpolate` by ordinary PyTorch operations, with all derivatives: for GPUs, and the compiled form's twin.
+    r"""`interpolate` by ordinary PyTorch operations, with all derivatives: for GPUs, and the compiled form's twin.
+
+    The weight of corner $k$ is $\prod_i (1 - u_i)^{1 - k_i} u_i^{k_i}$.
 
     >>> lattices, positions = build_lattices(np.zeros((1, 3), np.float32), (0.1,), radius=0.2)
     >>> x = torch.tensor([[0.03, -0.02, 0.11]])
@@ -119,7 +121,11 @@ def interpolate_in_torch(
 def pullback_in_torch(
     table: Float[Tensor, "N C"], x: Float[Tensor, "S 3"], cotangent: Float[Tensor, "S LC"], lattices: Lattices
 ) -> Float[Tensor, "S 3"]:
-    """`interpolation_pullback` by ordinary PyTorch operations.
+    r"""`interpolation_pullback` by ordinary PyTorch operations.
+
+    \[ (J^\top u)_i = \sum_k (F_k \cdot u) \, \frac{\partial}{\partial x_i} \prod_j (1 - t_j)^{1 - k_j} t_j^{k_j} \]
+
+    with the position $t$ in the cell.
 
     >>> lattices, positions = build_lattices(np.zeros((1, 3), np.float32), (0.1,), radius=0.2)
     >>> u = torch.tensor([[1.0, 2.0, 3.0]])

@@ -22,7 +22,9 @@ OPEN_INTERVAL = 1e10
 def sphere_exit(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], radius: float = RADIUS
 ) -> Float[Tensor, "R"]:
-    """Distance along each ray, from inside the sphere around the origin of space, to where it leaves the sphere.
+    r"""Distance along each ray, from inside the sphere around the origin of space, to where it leaves the sphere.
+
+    \[ t = \sqrt{(o \cdot d)^2 - \lVert o \rVert^2 + R^2} - o \cdot d \]
 
     >>> sphere_exit(torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]]))
     tensor([2.])
@@ -43,7 +45,9 @@ def inverse_distances(
     generator: torch.Generator | None = None,
     device: torch.device | str = "cpu",
 ) -> Float[Tensor, "rays n"]:
-    """Inverse distances from the sphere (1 / radius) towards infinity (0), one in each of `count` strata.
+    r"""Inverse distances from the sphere (1 / radius) towards infinity (0), one in each of `count` strata.
+
+    \[ \rho_i = \frac{1}{R} \Big( 1 - \frac{i}{n - 1} \Big) \]
 
     >>> inverse_distances(1, count=3, radius=2.0)
     tensor([[0.5000, 0.2500, 0.0000]])
@@ -65,7 +69,9 @@ def inverse_distances(
 
 
 def inverse_intervals(inverse: Float[Tensor, "R n"]) -> Float[Tensor, "R n"]:
-    """Length of each sample's interval in inverse distance; the last one is open.
+    r"""Length of each sample's interval in inverse distance; the last one is open.
+
+    \[ \delta_i = \rho_i - \rho_{i+1}, \qquad \delta_n = 10^{10} \]
 
     >>> inverse_intervals(torch.tensor([[0.5, 0.25, 0.0]]))
     tensor([[2.5000e-01, 2.5000e-01, 1.0000e+10]])
@@ -76,7 +82,9 @@ def inverse_intervals(inverse: Float[Tensor, "R n"]) -> Float[Tensor, "R n"]:
 def inverted_sphere_points(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], inverse: Float[Tensor, "R n"]
 ) -> Float[Tensor, "R n 4"]:
-    """The points of rays at inverse distances rho from the origin of space, as (unit direction, rho) (NeRF++ Eq. 12).
+    r"""The points of rays at inverse distances rho from the origin of space, as (unit direction, rho) (NeRF++ Eq. 12).
+
+    \[ \Big( \rho p + \sqrt{1 - \rho^2 \lVert p \rVert^2} \, d, \; \rho \Big), \qquad p = o - (o \cdot d) d \]
 
     With p the foot of the perpendicular from the origin onto the ray and d the ray's direction, the point's direction
     is rho p + sqrt(1 - rho^2 |p|^2) d. That is where rotating the sphere hit by asin(|p| / R) - asin(rho |p|) ends,

@@ -15,7 +15,9 @@ POSE_INPUTS = 66
 def line_features(
     lines: Float[Tensor, "J f k 3"], coordinates: Float[Tensor, "n 3"], part: Int[Tensor, "n"]
 ) -> Float[Tensor, "n C"]:
-    """Linear interpolation in tables along each axis of a box: f features of x, then of y, then of z (C = 3 f).
+    r"""Linear interpolation in tables along each axis of a box: f features of x, then of y, then of z (C = 3 f).
+
+    \[ h(u) = (1 - f) L_k + f L_{k+1}, \qquad k + f = \tfrac12 (u + 1)(n - 1) \]
 
     The first and last of the k bins lie at -1 and 1; coordinates beyond take these.
 

@@ -96,7 +96,9 @@ class ImageConditionedNerf(nn.Module):
 
 @torch.no_grad()
 def offset_to_nearest_bone(x_canonical: Float[Tensor, "S 3"], joints: Float[Tensor, "24 3"]) -> Float[Tensor, "S 3"]:
-    """x_c - j, with j the parent joint of the bone segment (of 23) that is nearest to x_c; no gradient.
+    r"""x_c - j, with j the parent joint of the bone segment (of 23) that is nearest to x_c; no gradient.
+
+    \[ x_c - J_{p(b)}, \qquad b = \arg\min_b \min_{0 \le t \le 1} \lVert x_c - J_{p(b)} - t (J_b - J_{p(b)}) \rVert \]
 
     >>> joints = torch.arange(24.0)[:, None] * torch.tensor([0.0, 1.0, 0.0])
     >>> offset_to_nearest_bone(torch.tensor([[2.0, -1.0, 0.0]]), joints)

@@ -31,7 +31,9 @@ _HIDDEN = 96
 
 
 def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "count"]:
-    """Indices of points chosen one after the other, each the farthest from those before; begins with the first point.
+    r"""Indices of points chosen one after the other, each the farthest from those before; begins with the first point.
+
+    \[ i_{k+1} = \arg\max_i \min_{j \le k} \lVert x_i - x_{i_j} \rVert \]
 
     >>> farthest_points(torch.tensor([[0.0, 0, 0], [0.4, 0, 0], [1.0, 0, 0]]), 3)
     tensor([0, 2, 1])
@@ -52,7 +54,9 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "co
 def choose_positions(
     coordinates: Float[Tensor, "n 19 3"], half_sizes: Float[Tensor, "19 3"], count: int = 200
 ) -> Float[Tensor, "count 19 3"]:
-    """Box coordinates of `count` surface points for each part, as far from each other as can be.
+    r"""Box coordinates of `count` surface points for each part, as far from each other as can be.
+
+    \[ \{ u_{jk} \} \subset \{ u_j : x \text{ in box } j \} \text{ by farthest points of } S_j u_j \]
 
     Each point belongs to the nearest box that holds it (`assign_to_boxes`); points in no box are left out. The authors'
     programs choose 1000 of each part first and 200 of these later, which are the same 200.
@@ -79,7 +83,16 @@ def choose_positions(
 
 
 def two_hop_mask() -> Float[Tensor, "19 19"]:
-    """Zero where a part (row) may be moved by another (column), minus infinity elsewhere: added to skinning logits."""
+    r"""Zero where a part (row) may be moved by another (column), minus infinity elsewhere: added to skinning logits.
+
+    \[ m_{ij} = 0 \text{ where } j \in N(i), \text{ else } -\infty \]
+
+    with the parts $N(i)$ that `TWO_HOPS` names.
+
+    >>> mask = two_hop_mask()
+    >>> mask.shape, float(mask.diagonal().abs().max()), float(mask.min())
+    (torch.Size([19, 19]), 0.0, -inf)
+    """
     mask = torch.full((PARTS, PARTS), -torch.inf)
     for row, part in enumerate(RIGID_PARTS):
         mask[row, [RIGID_PARTS.index(other) for other in TWO_HOPS[part]]] = 0
@@ -163,7 +176,15 @@ class PointCloud(nn.Module):
 
 
 def nearest_neighbours(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "n count"]:
-    """The nearest `count` points of each point; itself first."""
+    r"""The nearest `count` points of each point; itself first.
+
+    $k$ indices of each point that minimise the distance $\lVert x_i - x_j \rVert$, itself first.
+
+    >>> nearest_neighbours(torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0]]), 2)
+    tensor([[0, 1],
+            [1, 0],
+            [2, 1]])
+    """
     distances = torch.cdist(points, points)
     distances.fill_diagonal_(-1)
     return distances.topk(count, dim=1, largest=False).indices

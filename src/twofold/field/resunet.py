@@ -123,7 +123,11 @@ class ViewBlending(nn.Module):
 def sample_maps(
     maps: Float[Tensor, "v c i j"], pixels: Float[Tensor, "v S 2"], size: tuple[int, int]
 ) -> Float[Tensor, "S v c"]:
-    """Values of maps at pixels of the images they belong to: bilinear, corner pixels aligned, zero outside.
+    r"""Values of maps at pixels of the images they belong to: bilinear, corner pixels aligned, zero outside.
+
+    \[ f(x) = \sum_{a,b \in \{0,1\}} (1 - u)^{1-a} u^a (1 - v)^{1-b} v^b \, F_{ab} \]
+
+    with the position $(u, v)$ between the four nearest nodes.
 
     >>> image = torch.arange(4.0).reshape(1, 1, 2, 2)
     >>> sample_maps(image, torch.tensor([[[0.5, 0.0], [1.0, 1.0]]]), (2, 2))[:, 0, 0]

@@ -12,7 +12,9 @@ MODULATION_SCALE, MODULATION_OFFSET = 15.0, 30.0
 
 
 def siren_bound(inputs: int, frequency: float) -> float:
-    """Bound of the uniform initial weights of a layer after the first: sqrt(6 / inputs) / frequency.
+    r"""Bound of the uniform initial weights of a layer after the first: sqrt(6 / inputs) / frequency.
+
+    \[ \frac{1}{\omega} \sqrt{6 / n} \]
 
     >>> siren_bound(6, frequency=4.0)
     0.25
@@ -23,7 +25,14 @@ def siren_bound(inputs: int, frequency: float) -> float:
 def siren_linear(
     inputs: int, outputs: int, frequency: float, generator: torch.Generator | None = None, is_first: bool = False
 ) -> nn.Linear:
-    """A linear layer whose weights start at U(+-1 / inputs) for a first layer, else U(+-`siren_bound`).
+    r"""A linear layer whose weights start at U(+-1 / inputs) for a first layer, else U(+-`siren_bound`).
+
+    \[ W \sim U(\pm 1 / n) \text{ in a first layer, else } U\Big(\pm \tfrac{1}{\omega} \sqrt{6 / n}\Big),
+    \qquad b \sim U(\pm 1 / \sqrt n) \]
+
+    >>> layer = siren_linear(6, 500, frequency=4.0, generator=torch.Generator().manual_seed(0))
+    >>> bool(0.24 < layer.weight.abs().max() <= 0.25)
+    True
 
     Biases start at U(+-1 / sqrt(inputs)).
     """
@@ -54,7 +63,9 @@ class SineLayer(nn.Module):
 def modulated_sine(
     x: Float[Tensor, "*b n"], frequency: Float[Tensor, "*b n"], phase: Float[Tensor, "*b n"]
 ) -> Float[Tensor, "*b n"]:
-    """sin((15 f + 30) x + phase): a layer's frequencies and phases come from another network (pi-GAN, PM-Avatar).
+    r"""sin((15 f + 30) x + phase): a layer's frequencies and phases come from another network (pi-GAN, PM-Avatar).
+
+    \[ \sin\big((15 f + 30) x + \phi\big) \]
 
     >>> modulated_sine(torch.ones(1), torch.tensor([-2.0]), torch.zeros(1))
     tensor([0.])

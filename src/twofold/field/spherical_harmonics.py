@@ -6,7 +6,10 @@ from torch import Tensor
 
 
 def spherical_harmonics(directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 16"]:
-    """The 16 real spherical harmonics of degrees 0 to 3 ("degree 4" as encodings count), by degree, then order -l..l.
+    r"""The 16 real spherical harmonics of degrees 0 to 3 ("degree 4" as encodings count), by degree, then order -l..l.
+
+    \[ Y_l^m(d), \quad l = 0 \dots 3, \quad m = -l \dots l,
+    \qquad \int Y_l^m Y_{l'}^{m'} \, \mathrm{d}\Omega = \delta_{ll'} \delta_{mm'} \]
 
     Orthonormal on the unit sphere, with the sign (-1)^m of Condon and Shortley, as instant NGP has it.
 

@@ -18,7 +18,16 @@ MIN_DIRECTION = 1e-9
 def clip_to_bone_boxes(
     rays: Rays, world_to_frame: Float[Tensor, "J 4 4"], half_sizes: Float[Tensor, "J 3"], scale: float = BOX_SCALE
 ) -> tuple[Rays, Bool[Tensor, "R"]]:
-    """Rays with near and far where they enter the first and leave the last box that they meet, and which meet any.
+    r"""Rays with near and far where they enter the first and leave the last box that they meet, and which meet any.
+
+    \[ t_n = \min_j \max_i \min(t^-_{ji}, t^+_{ji}), \qquad t_f = \max_j \min_i \max(t^-_{ji}, t^+_{ji}),
+    \qquad t^\pm = \frac{\pm s - u_{ji}(o)}{u_{ji}(d)} \]
+
+    >>> ahead, never = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([torch.inf])
+    >>> ray = Rays(-3 * ahead, ahead, torch.zeros(1), never)
+    >>> clipped, hit = clip_to_bone_boxes(ray, torch.eye(4)[None], torch.tensor([[0.5, 0.5, 1.0]]), scale=1.0)
+    >>> clipped.near, clipped.far, hit
+    (tensor([2.]), tensor([4.]), tensor([True]))
 
     Computed in double precision: directions along a face are divided by nearly zero.
 
@@ -47,7 +56,17 @@ def clip_to_bone_boxes(
 def clip_to_cylinder(
     rays: Rays, joints: Float[Tensor, "24 3"], up: Float[Tensor, "3"], margin: float = CYLINDER_MARGIN
 ) -> tuple[Rays, Bool[Tensor, "R"]]:
-    """Rays with near and far where they enter and leave the endless cylinder around a body, and which meet it.
+    r"""Rays with near and far where they enter and leave the endless cylinder around a body, and which meet it.
+
+    \[ \lVert P (o + t d - J_0) \rVert = r, \qquad P = I - u u^\top,
+    \qquad r = \max_j \lVert P (J_j - J_0) \rVert + m \]
+
+    >>> joints, up = torch.zeros(24, 3), torch.tensor([0.0, 1.0, 0.0])
+    >>> ahead, never = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([torch.inf])
+    >>> ray = Rays(-3 * ahead, ahead, torch.zeros(1), never)
+    >>> clipped, hit = clip_to_cylinder(ray, joints, up, margin=0.25)
+    >>> clipped.near, clipped.far, hit
+    (tensor([2.7500]), tensor([3.2500]), tensor([True]))
 
     The axis goes up through the pelvis; the radius is the largest distance of a joint from it, and `margin` more. It is
     where rays that miss all boxes are sampled in the authors' programs. Rays that miss the cylinder too stay as they

@@ -11,7 +11,9 @@ WEIGHT_FLOOR = 0.01
 
 
 def blurred_weights(weights: Float[Tensor, "R n"]) -> Float[Tensor, "R m"]:
-    """(max(w_{i-1}, w_i) + max(w_i, w_{i+1})) / 2 + 0.01 for all samples but the first and last (m = n - 2).
+    r"""(max(w_{i-1}, w_i) + max(w_i, w_{i+1})) / 2 + 0.01 for all samples but the first and last (m = n - 2).
+
+    \[ w'_i = \tfrac12 \big( \max(w_{i-1}, w_i) + \max(w_i, w_{i+1}) \big) + 0.01 \]
 
     A sample beside a surface gets a share of its neighbour's weight, so that a surface between two samples is found.
 
@@ -29,7 +31,10 @@ def importance_depths(
     count: int,
     generator: torch.Generator | None = None,
 ) -> Float[Tensor, "R count"]:
-    """Depths drawn from a distribution that is constant between the middles of neighbouring depths; no gradient.
+    r"""Depths drawn from a distribution that is constant between the middles of neighbouring depths; no gradient.
+
+    \[ t = F^{-1}(q), \qquad F' \propto w'_i
+    \text{ between } \tfrac12 (t_{i-1} + t_i) \text{ and } \tfrac12 (t_i + t_{i+1}) \]
 
     >>> depths = torch.tensor([[0.0, 1.0, 2.0, 3.0]])
     >>> importance_depths(depths, torch.tensor([[0.0, 1.0, 0.0, 0.0]]), 3).round(decimals=2)

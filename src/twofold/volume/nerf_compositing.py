@@ -21,7 +21,9 @@ MIN_DENSITY = 2.0
 
 
 def open_samples(depths: Float[Tensor, "R n"], last: float = OPEN_INTERVAL) -> Samples:
-    """Packed samples at all depths of each ray; the last one's interval is open.
+    r"""Packed samples at all depths of each ray; the last one's interval is open.
+
+    \[ \delta_i = t_{i+1} - t_i, \qquad \delta_n = 10^{10} \]
 
     >>> open_samples(torch.tensor([[1.0, 1.5]]), last=9.0)
     Samples(ray_index=tensor([0, 0]), depth=tensor([1.0000, 1.5000]), delta=tensor([0.5000, 9.0000]))
@@ -37,7 +39,9 @@ def open_samples(depths: Float[Tensor, "R n"], last: float = OPEN_INTERVAL) -> S
 
 
 def alpha_of_density(density: Float[Tensor, "S"], delta: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
-    """alpha = 1 - exp(-sigma delta): how much of the light a sample stops.
+    r"""alpha = 1 - exp(-sigma delta): how much of the light a sample stops.
+
+    \[ \alpha = 1 - e^{-\sigma \delta} \]
 
     >>> alpha_of_density(torch.tensor([0.0, 2.0]), torch.tensor([1.0, 1e10]))
     tensor([0., 1.])
@@ -46,7 +50,9 @@ def alpha_of_density(density: Float[Tensor, "S"], delta: Float[Tensor, "S"]) -> 
 
 
 def alpha_weights(alpha: Float[Tensor, "S"], ray_index: Int[Tensor, "S"]) -> Float[Tensor, "S"]:
-    """What each sample adds to its ray: alpha_i prod_{j<i} (1 - alpha_j + 1e-10).
+    r"""What each sample adds to its ray: alpha_i prod_{j<i} (1 - alpha_j + 1e-10).
+
+    \[ w_i = \alpha_i \prod_{j<i} (1 - \alpha_j + 10^{-10}) \]
 
     >>> alpha_weights(torch.tensor([0.5, 0.5, 1.0]), torch.tensor([0, 0, 1]))
     tensor([0.5000, 0.2500, 1.0000])
@@ -63,7 +69,9 @@ def alpha_weights(alpha: Float[Tensor, "S"], ray_index: Int[Tensor, "S"]) -> Flo
 def open_density_weights(
     density: Float[Tensor, "S"], delta: Float[Tensor, "S"], ray_index: Int[Tensor, "S"]
 ) -> Float[Tensor, "S"]:
-    """What each sample adds to its ray, exp(-sum_{j<i} sigma_j delta_j) (1 - exp(-sigma_i delta_i)), for NPC.
+    r"""What each sample adds to its ray, exp(-sum_{j<i} sigma_j delta_j) (1 - exp(-sigma_i delta_i)), for NPC.
+
+    \[ w_i = e^{-\sum_{j<i} \sigma_j \delta_j} \, (1 - e^{-\sigma_i \delta_i}) \]
 
     As `volume.rendering.composite_weights`, but accurate with open intervals, where that one loses digits.
 
@@ -81,7 +89,9 @@ def open_density_weights(
 
 
 def without_thin_density(density: Float[Tensor, "*b"], min_density: float = MIN_DENSITY) -> Float[Tensor, "*b"]:
-    """Densities below `min_density` (per metre) set to zero, as NPC renders test images.
+    r"""Densities below `min_density` (per metre) set to zero, as NPC renders test images.
+
+    \[ \sigma' = \sigma \text{ where } \sigma \ge \sigma_{\min}, \text{ else } 0 \]
 
     >>> without_thin_density(torch.tensor([1.9, 2.0]))
     tensor([0., 2.])
