@@ -153,7 +153,15 @@ def map_to_canonical(
     shares: Float[Tensor, "S K"],
     forward: Float[Tensor, "V 3 4"],
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 4"]]:
-    """Canonical points as `to_canonical` gives them, and each sample's whole posed-to-canonical transform."""
+    r"""Canonical points as `to_canonical` gives them, and each sample's whole posed-to-canonical transform.
+
+    \[ x_c = (A \mid t) \, x_o, \qquad (A \mid t) = \Big( \sum_k \omega_k F_{v_k} \Big)^{-1} \]
+
+    >>> forward = torch.tensor([[[2.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]]])
+    >>> x_c, inverse = map_to_canonical(torch.tensor([[5.0, 0.0, 0.0]]), torch.tensor([[0]]), torch.ones(1, 1), forward)
+    >>> x_c, inverse[0, 0, [0, 3]]
+    (tensor([[2., 0., 0.]]), tensor([ 0.5000, -0.5000]))
+    """
     rows = _inverse_rows(nearest, shares, forward)
     # A product of the whole batch with elementwise sums: batched 3x3 matrix products are slow on CPUs.
     return (rows[..., :3] * x_posed[:, None, :]).sum(-1) + rows[..., 3], rows
@@ -188,7 +196,19 @@ def with_pose_gradient(
     weights: Float[Tensor, "S K"],
     forward: Float[Tensor, "V 3 4"],
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 3"]]:
-    """What `to_canonical` returns, from results of `map_to_canonical` without gradients; differentiable by `forward`.
+    r"""What `to_canonical` returns, from results of `map_to_canonical` without gradients; differentiable by `forward`.
+
+    \[ \frac{\partial L}{\partial t} = -A^{-\top} g, \qquad
+    \frac{\partial L}{\partial A} = -A^{-\top} g \, x_c^\top - A^{-\top} G A^{-\top} \]
+
+    with the blended transform $(A \mid t)$ and the gradients $g$ by $x_c$ and $G$ by $A^{-1}$.
+
+    >>> forward = torch.tensor([[[2.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]]]).requires_grad_()
+    >>> vertex, one = torch.tensor([[0]]), torch.ones(1, 1)
+    >>> x_c, inverse = map_to_canonical(torch.tensor([[5.0, 0.0, 0.0]]), vertex, one, forward.detach())
+    >>> with_pose_gradient(x_c, inverse, vertex, one, forward)[0][0, 0].backward()
+    >>> forward.grad[0, 0, [0, 3]]  # of (5 - t) / a at a = 2, t = 1
+    tensor([-1.0000, -0.5000])
 
     Samplers map samples once to choose among them; nothing is computed again for the samples that are kept.
 

@@ -11,7 +11,13 @@ RELEASED_SLACK = 0.01
 
 
 def joint_box(joints: Float[Tensor, "J 3"], scale: float = 1.0) -> Float[Tensor, "2 3"]:
-    """Lower and upper corner of the axis-aligned box around joints, without gradients.
+    r"""Lower and upper corner of the axis-aligned box around joints, without gradients.
+
+    \[ [\min_j J_j - m, \; \max_j J_j + m], \qquad m = 0.3 + 0.01 / s \]
+
+    >>> joint_box(torch.zeros(24, 3), scale=0.5)
+    tensor([[-0.3200, -0.3200, -0.3200],
+            [ 0.3200,  0.3200,  0.3200]])
 
     Args:
         joints: metres.

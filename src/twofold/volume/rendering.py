@@ -47,7 +47,14 @@ def composite_weights(density: Float[Tensor, "S"], samples: Samples) -> Float[Te
 
 
 def optical_depth(optical: Float[Tensor, "S"], samples: Samples) -> Float[Tensor, "S"]:
-    """Sum of sigma_j delta_j over the samples j before each one on its ray."""
+    r"""Sum of sigma_j delta_j over the samples j before each one on its ray.
+
+    \[ \tau_i = \sum_{j<i} \sigma_j \delta_j \]
+
+    >>> samples = Samples(torch.tensor([0, 0, 0, 1, 1]), torch.arange(5.0), torch.ones(5))
+    >>> optical_depth(torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0]), samples)
+    tensor([0., 1., 3., 0., 8.])
+    """
     # One running sum over all rays would lose digits in float32; what a ray starts with is taken off again.
     total = torch.cumsum(optical.double(), 0)
     before = total - optical
