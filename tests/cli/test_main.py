@@ -215,13 +215,17 @@ def test_a_run_is_trained_drawn_and_measured_and_each_command_says_where_and_wha
     main(["render", str(run), "--what", "views"])
     assert f"twofold evaluate {run}" in " ".join(capsys.readouterr().err.split())
     main(["evaluate", str(run), "--most", "2"])
-    assert str(run / "metrics.json") in " ".join(capsys.readouterr().err.split())
+    again = " ".join(capsys.readouterr().err.split())
+    assert str(run / "metrics.json") in again
+    assert f"twofold train {person_folder} --recipe fast" in again  # all of this one has been shown
     metrics = json.loads((run / "metrics.json").read_text())
     assert 0 <= metrics["novel_view"]["silhouette_iou"] <= 1
     assert "protocol" in metrics["novel_view"]
     moved = shutil.copytree(person_folder, tmp_path / "moved")
+    (run / "metrics.json").unlink()
     main(["render", str(run), "--what", "views", "--capture", str(moved)])
     assert f"Next: twofold evaluate {run} --capture {moved}" in " ".join(capsys.readouterr().err.split())
+    shutil.rmtree(run / "renders")
     main(["evaluate", str(run), "--max-images", "1", "--max-meshes", "0", "--capture", str(moved)])
     assert f"Next: twofold render {run} --capture {moved}" in " ".join(capsys.readouterr().err.split())
     assert "already holds a run" in refused(capsys, "train", person_folder, "--out", run)
