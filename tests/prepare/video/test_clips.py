@@ -19,6 +19,7 @@ from twofold.prepare.video.clips import (
     clip_names,
     longer,
     open_clips,
+    read_frames,
     read_intrinsics,
     require_options,
 )
@@ -211,3 +212,20 @@ def test_a_longer_lens_is_the_same_camera_otherwise():
     torch.testing.assert_close(found.intrinsics, torch.tensor([[75.0, 0, 20], [0, 90, 10], [0, 0, 1]]))
     assert start.intrinsics[0, 0] == 50
     assert (found.height, found.width) == (30, 40)
+
+
+def test_intrinsics_of_larger_images_are_refused_before_any_work(tmp_path):
+    """Those of 480 x 320 for a video of 240 x 160; of a crop the middle is elsewhere, which is fine."""
+    clip = a_clip(tmp_path)
+    with pytest.raises(TwofoldError, match=r"the middle of images of about 480x320, and the video has\s240x160"):
+        open_clips([clip], replace(PLAIN, intrinsics=(500.0, 500.0, 239.5, 159.5)))
+    assert open_clips([clip], replace(PLAIN, intrinsics=(500.0, 500.0, 239.5, 79.5)))[0].info.width == 240
+
+
+@pytest.mark.parametrize("text", ["", "x", "3-", "7-3", "1,,2", "-1"])
+def test_lists_of_frames_are_numbers_and_ranges(text):
+    assert read_frames("0, 3,7-9") == (0, 3, 7, 8, 9)
+    assert read_frames(None) == ()
+    if text:
+        with pytest.raises(TwofoldError, match="such as 3,7-9"):
+            read_frames(text)
