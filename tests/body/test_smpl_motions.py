@@ -106,9 +106,10 @@ def test_centimetres_are_metres_times_a_hundred(tmp_path):
     torch.testing.assert_close(found.motion.translations.float(), MOVED.translations, atol=0.012, rtol=0)
 
 
-def test_feet_stay_where_they_stand_on_other_legs(tmp_path):
-    body = stick_body(thigh=0.95, shin=1.05, size=1.1)
-    motion = BUILTIN_MOTIONS["walk"](SMPL_SIZED)
+@pytest.mark.parametrize("name", ["walk", "turn", "range-of-motion"])
+def test_feet_stay_where_they_stand_on_other_legs(tmp_path, name):
+    body = stick_body(thigh=0.95, shin=1.05, hips=1.1, size=1.1)
+    motion = BUILTIN_MOTIONS[name](SMPL_SIZED)
     path = saved(tmp_path, {"poses": motion.poses.numpy(), "trans": motion.translations.numpy(), "fps": 30.0})
     found = read_smpl_motion(path, body)
     assert slide_of_standing_feet(SMPL_SIZED, motion, body, found.motion) < 0.01

@@ -70,8 +70,8 @@ def kept_contacts(
         joints: of the target's T-pose, metres.
         sole: height of the target's soles in the T-pose, metres.
         toes: paths of the source's foot fronts (left, right), scaled to the target's size, y up, metres.
-        still: metres that a resting foot of the source may stray without being followed, where its path is not known
-            better than that.
+        still: metres that a resting foot of the source may stray, or be above the floor, without being followed, where
+            its path is not known better than that.
     """
     rests = resting(toes, motion.fps)
     if not rests.any():
@@ -80,7 +80,9 @@ def kept_contacts(
     own = positions[:, list(TOES)]
     rise = float(joints[list(TOES), 1].mean()) - sole
     wanted = toes.double() - torch.tensor([0.0, _floor(toes, rests) - rise, 0.0])
-    changes = torch.stack([_corrections(wanted[:, s], own[:, s], rests[:, s].numpy(), still) for s in (0, 1)], 1)
+    changes = torch.stack(
+        [_corrections(wanted[:, s], own[:, s], rests[:, s].numpy(), rise, still) for s in (0, 1)], 1
+    )
     root = _shared(changes, rests, motion.fps)
     # A foot in the air goes with the pelvis; only what it has to make up for on the floor is passed on.
     apart = torch.stack([_between(changes[:, s] - root, rests[:, s].numpy()) for s in (0, 1)], 1)
@@ -97,7 +99,7 @@ def _floor(toes: Float[Tensor, "T 2 3"], rests: Bool[Tensor, "T 2"]) -> float:
 
 
 def _corrections(
-    wanted: Float[Tensor, "T 3"], own: Float[Tensor, "T 3"], rests: Bool[np.ndarray, "T"], still: float
+    wanted: Float[Tensor, "T 3"], own: Float[Tensor, "T 3"], rests: Bool[np.ndarray, "T"], rise: float, still: float
 ) -> Float[Tensor, "T 3"]:
     """How far a foot is to be moved.
 
@@ -107,9 +109,12 @@ def _corrections(
     known = (wanted - own).numpy().copy()
     for first, end in _runs(rests):
         path = wanted[first:end].numpy()
-        stray = path - path.mean(0)
+        middle = path.mean(0)
+        stray = path - middle
         far = np.linalg.norm(stray, axis=1, keepdims=True)
         known[first:end] -= stray * np.minimum(1, still / np.maximum(far, 1e-12))
+        if abs(middle[1] - rise) < still:
+            known[first:end, 1] += rise - middle[1]
         known[first:end, [0, 2]] -= known[first:end, [0, 2]].mean(0)
     return _between(torch.from_numpy(known), rests)
 

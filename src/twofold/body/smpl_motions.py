@@ -19,7 +19,7 @@ from twofold.npz import read_npz
 SMPL_LEG = 0.78
 """Thigh and shin of SMPL's mean body, metres; where a file's body is not known, its legs are taken to be so long."""
 
-_STRAY = 0.01
+_STRAY = 0.05
 """Metres that a resting foot seems to move where the legs that moved are not known; it is then held still."""
 
 _LARGEST_ANGLE = 9.5
