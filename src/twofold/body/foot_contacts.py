@@ -80,9 +80,7 @@ def kept_contacts(
     own = positions[:, list(TOES)]
     rise = float(joints[list(TOES), 1].mean()) - sole
     wanted = toes.double() - torch.tensor([0.0, _floor(toes, rests) - rise, 0.0])
-    changes = torch.stack(
-        [_corrections(wanted[:, s], own[:, s], rests[:, s].numpy(), rise, still) for s in (0, 1)], 1
-    )
+    changes = torch.stack([_corrections(wanted[:, s], own[:, s], rests[:, s].numpy(), rise, still) for s in (0, 1)], 1)
     root = _shared(changes, rests, motion.fps)
     # A foot in the air goes with the pelvis; only what it has to make up for on the floor is passed on.
     apart = torch.stack([_between(changes[:, s] - root, rests[:, s].numpy()) for s in (0, 1)], 1)
