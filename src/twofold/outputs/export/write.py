@@ -63,10 +63,14 @@ def require_exportable(request: ExportRequest, capture: Capture) -> None:
     for frame in (request.frame, request.color):
         if isinstance(frame, int):
             frame_at(capture, frame)
-    needed = ["fast_simplification", *(["xatlas"] if request.config.texture else [])]
-    missing = [name.replace("_", "-") for name in needed if importlib.util.find_spec(name) is None]
-    if missing:
+    if missing := missing_packages(request.config):
         raise TwofoldError(f"Exporting needs {' and '.join(missing)}; run pip install 'twofold[export]'.")
+
+
+def missing_packages(config: BakeConfig) -> list[str]:
+    """Packages of the extra `export` that baking needs and that are not installed."""
+    needed = ["fast_simplification", *(["xatlas"] if config.texture else [])]
+    return [name.replace("_", "-") for name in needed if importlib.util.find_spec(name) is None]
 
 
 def export(
