@@ -10,7 +10,7 @@ from tiny_person import person_body
 from twofold.body.skeleton import pose_body, shape_body, skin
 from twofold.geometry.rotations import rigid_inverse
 from twofold.geometry.surfaces import vertex_normals
-from twofold.outputs.export.morphs import Skin, fit_morphs, morph_errors, pull_back
+from twofold.outputs.export.morphs import Skin, bounded_weights, fit_morphs, morph_errors, pull_back
 
 GROWN = 0.006
 
@@ -63,31 +63,48 @@ def made_of(components: int, frames: int, generator: torch.Generator) -> torch.T
     return 0.01 * torch.einsum("tk,kvc->tvc", weights, shapes) + 0.02
 
 
-def test_as_many_targets_as_there_are_shapes_explain_everything(generator) -> None:
+def test_twice_as_many_targets_as_there_are_shapes_explain_everything(generator) -> None:
     off = made_of(4, 20, generator)
-    known = torch.ones(20, 50, dtype=torch.bool)
-    morphs = fit_morphs(off, known, 16)
-    assert len(morphs.targets) == 4
+    morphs = fit_morphs(off, torch.ones(20, 50, dtype=torch.bool), 16)
+    assert len(morphs.targets) <= 8
     shown = morphs.mean + torch.einsum("tm,mvc->tvc", morphs.weights, morphs.targets)
-    assert torch.allclose(shown, off, atol=1e-5)
-    assert torch.allclose(morphs.weights_of(off), morphs.weights, atol=1e-3)
-    assert morphs.weights[:, :4].abs().amax(0).allclose(torch.ones(4), atol=1e-3)
+    assert torch.allclose(shown, off, atol=1e-4)
 
 
-def test_leading_targets_are_those_of_the_singular_values(generator) -> None:
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_weights_lie_between_zero_and_one_and_use_their_range(generator, count: int) -> None:
+    morphs = fit_morphs(made_of(9, 30, generator), torch.ones(30, 50, dtype=torch.bool), count)
+    assert morphs.weights.min() >= 0
+    assert morphs.weights.amax(0).allclose(torch.ones(len(morphs.targets)))
+
+
+def test_targets_are_as_near_as_half_as_many_principal_components(generator) -> None:
     off = made_of(9, 30, generator)
-    morphs = fit_morphs(off, torch.ones(30, 50, dtype=torch.bool), 3)
+    morphs = fit_morphs(off, torch.ones(30, 50, dtype=torch.bool), 6)
     left = off - morphs.mean - torch.einsum("tm,mvc->tvc", morphs.weights, morphs.targets)
     values = torch.linalg.svdvals((off - off.mean(0)).flatten(1))
-    assert left.norm() == pytest.approx(values[3:].norm().item(), rel=1e-3)
+    assert values[6:].norm() <= left.norm() <= values[3:].norm()
+
+
+def test_weights_of_a_surface_are_the_nearest_there_are(generator) -> None:
+    targets, off = torch.randn(3, 40, 3, generator=generator), torch.randn(5, 40, 3, generator=generator)
+    found = bounded_weights(targets, off)
+    grid = torch.linspace(0, 1, 41)
+    every = torch.cartesian_prod(grid, grid, grid)
+    for row, wanted in zip(found, off, strict=True):
+        errors = (torch.einsum("nm,mvc->nvc", every, targets) - wanted).flatten(1).norm(dim=1)
+        own = (torch.einsum("m,mvc->vc", row, targets) - wanted).norm()
+        assert own <= errors.min() + 1e-5
+        assert (row - every[errors.argmin()]).abs().max() < 0.03
 
 
 def test_errors_fall_with_targets_also_on_frames_left_out(generator) -> None:
     off = made_of(6, 40, generator)
     known = torch.ones(40, 50, dtype=torch.bool)
-    few, many = (morph_errors(off, known, count) for count in (2, 6))
+    few, many = (morph_errors(off, known, count) for count in (2, 12))
     assert many["fitted_with_mm"] < 0.01
-    assert many["left_out_with_mm"] < 0.01
+    # Weights beyond those of the fitted frames are cut off.
+    assert many["left_out_with_mm"] < 0.5 * many["left_out_without_mm"]
     assert few["fitted_with_mm"] < few["fitted_without_mm"]
     assert few["left_out_without_mm"] == many["left_out_without_mm"]
 

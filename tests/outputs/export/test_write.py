@@ -57,6 +57,7 @@ def test_surface_lies_on_the_avatars_own_in_every_training_pose(baked: Baked, av
 
 def test_morph_targets_bring_the_character_nearer_to_each_frame(baked: Baked, avatar: Avatar, person: Capture) -> None:
     shape = baked.shape
+    assert shape.weights.min() >= 0
     for row, frame in enumerate(shape.frames):
         back = pull_back(avatar, frame.of(avatar), shape.skin)
         shown = torch.einsum("m,mvc->vc", shape.weights[row], shape.targets)

@@ -13,7 +13,7 @@ from twofold.config import require_within
 from twofold.errors import TwofoldError
 from twofold.geometry.surfaces import face_areas
 from twofold.methods.base import Avatar, PosedAvatar
-from twofold.outputs.export.morphs import PulledBack, Skin, fit_morphs, morph_errors, pull_back
+from twofold.outputs.export.morphs import PulledBack, Skin, bounded_weights, fit_morphs, morph_errors, pull_back
 from twofold.outputs.export.repair import as_tensors, decimate, is_watertight, solid
 from twofold.outputs.export.rig import to_rest, transfer_weights
 from twofold.outputs.mesh import extract_surface, keep_largest
@@ -96,8 +96,7 @@ class BakedShape:
         if len(self.targets) == 0:
             return self.targets.new_zeros(0)
         back = pull_back(avatar, posed, self.skin, branch)
-        basis = self.targets.flatten(1)
-        return (basis @ back.displacement.flatten()) / basis.square().sum(1)
+        return bounded_weights(self.targets, back.displacement[None])[0]
 
 
 def rest_body(avatar: Avatar) -> PosedBody:

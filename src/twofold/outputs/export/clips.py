@@ -40,10 +40,14 @@ def _clip(baked: Baked, name: str, frames: Sequence[Pose], times: np.ndarray) ->
     poses, places = [], []
     weights: dict[int, np.ndarray] = {}
     for index, frame in enumerate(frames):
+        row = row_of[index]
+        if frame.frame_index is None and index not in asked:
+            poses.append(frame.pose.cpu().numpy())  # nothing corrects it, and nothing is to be asked there
+            places.append(frame.translation.cpu().numpy())
+            continue
         posed = frame.of(avatar)
         poses.append(posed.body.pose.cpu().numpy())
         places.append((posed.body.joints[0] - shape.skin.rest.joints[0]).cpu().numpy())
-        row = row_of[index]
         if row is not None:
             weights[index] = shape.weights[row].cpu().numpy()
         elif index in asked:

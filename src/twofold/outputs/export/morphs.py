@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.optimize import lsq_linear, nnls
 from torch import Tensor
 
 from twofold.body.skeleton import PosedBody
@@ -15,6 +17,7 @@ LIMIT = 0.03
 """How far the surface is looked for along a normal, metres."""
 _OFF = 0.002
 _MISPLACED = 0.04
+_ROUNDS = 15
 LEFT_OUT = 5
 """Every so many frames one is left out, to measure how targets do on frames that they were not fitted to."""
 
@@ -108,6 +111,8 @@ def pull_back(avatar: Avatar, posed: PosedAvatar, skin: Skin, branch: str = "ful
 class Morphs:
     """A mean shape and how it changes: displacement of frame t = mean + sum_k weights[t, k] targets[k].
 
+    Weights lie in 0..1, because that is what programs show: Blender and Unity cut off what is below or above.
+
     Attributes:
         mean: metres.
         targets: metres at weight 1.
@@ -119,16 +124,23 @@ class Morphs:
     weights: Float[Tensor, "T M"]
 
     def weights_of(self, displacements: Float[Tensor, "T V 3"]) -> Float[Tensor, "T M"]:
-        """Least-squares weights of displacements."""
-        if len(self.targets) == 0:
-            return displacements.new_zeros(len(displacements), 0)
-        basis, off = self.targets.flatten(1), (displacements - self.mean).flatten(1)
-        # Targets are orthogonal to each other, so that each weight stands alone.
-        return (off @ basis.T) / basis.square().sum(1)
+        """Weights in 0..1 that come nearest to displacements, by least squares."""
+        return bounded_weights(self.targets, displacements - self.mean)
+
+
+def bounded_weights(targets: Float[Tensor, "M V 3"], off: Float[Tensor, "T V 3"]) -> Float[Tensor, "T M"]:
+    """Weights in 0..1 with which targets come nearest to each of some displacements from their mean."""
+    basis, wanted = targets.flatten(1).double(), off.flatten(1).double()
+    weights = _least_squares((basis @ basis.T).cpu().numpy(), (basis @ wanted.T).cpu().numpy(), 1.0)
+    return torch.from_numpy(weights).to(off)
 
 
 def fit_morphs(displacements: Float[Tensor, "T V 3"], found: Bool[Tensor, "T V"], count: int) -> Morphs:
-    """The mean over frames and its `count` leading changes (principal components).
+    """The mean over frames and `count` targets whose sums, with weights in 0..1, come near to each frame.
+
+    Half as many principal components, each once with either sign, are the start. From there targets and weights are
+    improved in turn by least squares, targets freely, weights not below zero (semi-nonnegative matrix factorization,
+    Ding, Li, Jordan 2010), so the result is at least as near as those components are.
 
     Args:
         displacements: of the frames, metres.
@@ -138,18 +150,43 @@ def fit_morphs(displacements: Float[Tensor, "T V 3"], found: Bool[Tensor, "T V"]
     known = found[..., None].to(displacements.dtype)
     mean = (displacements * known).sum(0) / known.sum(0).clamp_min(1)
     off = ((displacements - mean) * known).flatten(1)
-    count = min(count, len(off) - 1)
-    if count < 1:
-        none = displacements.new_zeros(0, *mean.shape)
-        return Morphs(mean, none, displacements.new_zeros(len(off), 0))
-    values, vectors = torch.linalg.eigh((off @ off.T).double())
-    vectors = vectors[:, values.argsort(descending=True)[:count]].to(off.dtype)
-    targets = vectors.T @ off
-    largest = vectors.abs().amax(0).clamp_min(1e-12)
-    size = targets.norm(dim=-1)
-    kept = size > 1e-4 * size.max()  # what is smaller is rounding
-    targets, weights = (targets * largest[:, None])[kept], (vectors / largest)[:, kept]
-    return Morphs(mean, targets.unflatten(-1, mean.shape), weights)
+    # All targets are mixtures of the frames, so everything is done with the frames' products.
+    products = (off.double() @ off.double().T).cpu().numpy()
+    mixtures, weights = _mixtures(products, count)
+    if len(mixtures) == 0:
+        return Morphs(mean, off.new_zeros(0, *mean.shape), off.new_zeros(len(off), 0))
+    targets = (torch.from_numpy(mixtures).to(off) @ off).unflatten(-1, mean.shape)
+    return Morphs(mean, targets, torch.from_numpy(weights).to(off))
+
+
+def _mixtures(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Targets as mixtures of the frames (M x T) and the frames' weights (T x M), from the frames' products."""
+    values, vectors = np.linalg.eigh(products)
+    leading = np.argsort(values)[::-1][: (count + 1) // 2]
+    leading = leading[values[leading] > 1e-8 * max(values.max(initial=0), 1e-30)]  # what is smaller is rounding
+    signed = np.stack([vectors[:, leading], -vectors[:, leading]], -1).reshape(len(products), -1)
+    weights = signed.clip(0)[:, : min(count, 2 * len(leading))]
+    mixtures = np.linalg.pinv(weights)
+    for _ in range(_ROUNDS):
+        weights = _least_squares(mixtures @ products @ mixtures.T, mixtures @ products, np.inf)
+        mixtures = np.linalg.pinv(weights)
+    weights = _least_squares(mixtures @ products @ mixtures.T, mixtures @ products, np.inf)
+    largest = weights.max(0, initial=0)
+    used = largest > 1e-6
+    return (mixtures * largest[:, None])[used], (weights / np.maximum(largest, 1e-12))[:, used]
+
+
+def _least_squares(squares: np.ndarray, products: np.ndarray, most: float) -> np.ndarray:
+    """Weights in 0..most that minimise w' squares w - 2 w' products, for each column of `products`; one a row."""
+    count = len(squares)
+    if count == 0:
+        return np.zeros((products.shape[1], 0))
+    slack = 1e-9 * max(np.trace(squares) / count, 1e-30)
+    root = np.linalg.cholesky(squares + slack * np.eye(count))
+    sides = np.linalg.solve(root, products)
+    if np.isinf(most):
+        return np.stack([nnls(root.T, side)[0] for side in sides.T])
+    return np.stack([lsq_linear(root.T, side, (0, most), method="bvls").x.clip(0, most) for side in sides.T])
 
 
 def morph_errors(displacements: Float[Tensor, "T V 3"], found: Bool[Tensor, "T V"], count: int) -> dict[str, float]:
