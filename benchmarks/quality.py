@@ -20,10 +20,10 @@ import torch
 from benchmarks.common import store, studio_capture
 from benchmarks.step import reference
 from twofold.capture.types import Capture
-from twofold.cli.demo import demo_recipe
 from twofold.evaluation import measure_split
 from twofold.kernels.runtime import tune_process
 from twofold.methods.base import Avatar
+from twofold.methods.factorized_recipes import demo_recipe
 from twofold.training import loop
 
 SMALL = 48

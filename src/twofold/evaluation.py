@@ -79,7 +79,10 @@ def measure_split(
         picture = draw_frame(avatar, capture, frame, refined)
         image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         ignored = frame.ignored()
-        rows.append(image_metrics.compare(picture.color, image, picture.opacity, mask, ignored))
+        row = image_metrics.compare(picture.color, image, picture.opacity, mask, ignored)
+        if picture.base_opacity is not None:
+            row["base_silhouette_iou"] = image_metrics.silhouette_iou(picture.base_opacity, mask, ignored=ignored)
+        rows.append(row)
         shares.append(ignored[image_metrics.subject_box(mask)].float().mean().item())
         if watch:
             watch(frame, picture)
@@ -96,6 +99,8 @@ def measure_split(
         "poses": poses,
         "background": f"constant {capture.background}",
     }
+    if "base_silhouette_iou" in means:
+        protocol["base_silhouette_iou"] = "silhouette_iou of the pose-independent branch rendered alone"
     if any(shares):
         protocol["ignored"] = image_metrics.IGNORED_PROTOCOL.format(share=100 * float(np.mean(shares)))
     return means | {"protocol": protocol}
@@ -158,19 +163,40 @@ def evaluate(
     avatar: Avatar, capture: Capture, folder: Path, most: int | None = MAX_IMAGES, meshes: int | None = 4,
     show: Callable[[float, str], None] | None = None, extra: dict[str, object] | None = None,
 ) -> dict[str, object]:  # fmt: skip
-    """Measures everything that the capture knows the truth of and writes `metrics.json` into the run.
+    """`measure` with its metrics written to `metrics.json` in the run's folder.
 
     Args:
         avatar: to measure.
-        capture: with the truth.
+        capture: with ground truth.
         folder: the run.
-        most: at most so many images a split, evenly spread; None for all.
-        meshes: at most so many true meshes, evenly spread; None for all.
-        show: told the share that is done and what is being measured.
+        most: at most so many images a split; None for all.
+        meshes: at most so many ground-truth meshes.
+        show: progress, with the part that is done and what is being measured.
         extra: further sections for the file.
 
     Raises:
-        TwofoldError: a picture or mesh is damaged, or the avatar's numbers are not finite.
+        TwofoldError: an image or mesh is damaged, or the avatar's numbers are not finite.
+    """
+    metrics = measure(avatar, capture, most, meshes, show) | (extra or {})
+    write_json(folder / "metrics.json", metrics)
+    return metrics
+
+
+def measure(
+    avatar: Avatar, capture: Capture, most: int | None = MAX_IMAGES, meshes: int | None = 4,
+    show: Callable[[float, str], None] | None = None,
+) -> dict[str, object]:  # fmt: skip
+    """Metrics of everything that the capture knows the ground truth of.
+
+    Args:
+        avatar: to measure.
+        capture: with ground truth.
+        most: at most so many images a split; None for all.
+        meshes: at most so many ground-truth meshes.
+        show: progress, with the part that is done and what is being measured.
+
+    Raises:
+        TwofoldError: an image or mesh is damaged, or the avatar's numbers are not finite.
     """
     few = min(most or 8, 8)
     for time in _with_mesh(capture, meshes):
@@ -201,8 +227,6 @@ def evaluate(
         metrics["pose_refinement"] = measure_refinement(
             avatar, capture, few, trained, lambda f, p: watch("pose refinement")
         )
-    metrics |= extra or {}
-    write_json(folder / "metrics.json", metrics)
     return metrics
 
 

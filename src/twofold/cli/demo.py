@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -16,7 +15,7 @@ from twofold.evaluation import evaluate, with_protocols
 from twofold.files import plain_errors, write_json
 from twofold.inputs import read_json
 from twofold.methods.base import Avatar
-from twofold.methods.factorized_recipes import quick
+from twofold.methods.factorized_recipes import demo_recipe
 from twofold.metrics.image import to_8bit
 from twofold.outputs.export.bake import BakeConfig
 from twofold.outputs.export.write import ExportRequest, export, missing_packages
@@ -50,17 +49,6 @@ MARK = "demo.json"
 
 EXPORT = ExportRequest(("glb", "vrm"), BakeConfig(frames=24))
 """What the demo leaves for other programs, where the packages for it are installed."""
-
-
-def demo_recipe(seed: int) -> Recipe:
-    """`quick` with as many steps as two minutes of two cores hold."""
-    recipe = quick()
-    # With few pictures and exact poses, slower rates show unseen views better.
-    rates = replace(recipe.method.rates, grid=5e-3, low=1e-3, high=1e-3)
-    training = replace(recipe.training, steps=900, checkpoint_every=300, preview_every=0)
-    # The studio's poses are exact; there is nothing to correct.
-    method = replace(recipe.method, pose=replace(recipe.method.pose, refine=()), rates=rates)
-    return replace(recipe, name="demo", method=method, training=training, seed=seed)
 
 
 def run_demo(out: Path, seed: int, show: Callable[[float, str], None]) -> Path:

@@ -16,7 +16,10 @@ from twofold.methods.base import Avatar, PosedAvatar, Rendering
 
 @dataclass(frozen=True)
 class Picture:
-    """A rendered picture; fields as in `Rendering`, as images. `residual` is the full colour minus the base one."""
+    """A rendered image; fields as in `Rendering`, as images. `residual` is the full colour minus the base one.
+
+    Without a base branch, `base` and `base_normal` are those of the whole, and `base_opacity` is None.
+    """
 
     color: Float[Tensor, "h w 3"]
     opacity: Float[Tensor, "h w"]
@@ -24,6 +27,7 @@ class Picture:
     normal: Float[Tensor, "h w 3"]
     base: Float[Tensor, "h w 3"]
     base_normal: Float[Tensor, "h w 3"]
+    base_opacity: Float[Tensor, "h w"] | None = None
 
     @property
     def residual(self) -> Float[Tensor, "h w 3"]:
@@ -66,13 +70,16 @@ def draw(
     clipped, hit = clip_to_box(rays, low, high)
     wanted = hit.nonzero()[:, 0]
     pixels = camera.height * camera.width
-    out = torch.zeros(pixels, 14, device=device)
+    out = torch.zeros(pixels, 15, device=device)
+    has_base = False
     out[:, :3], out[:, 8:11] = background, background
     for part in wanted.split(chunk or rays_at_once(device)):
         chosen: Rays = clipped[part]
         whole = avatar.render(chosen, posed, background)
         base: Rendering = whole.base or whole
+        has_base = whole.base is not None
         columns = [whole.color, whole.opacity[:, None], whole.depth[:, None], whole.normal, base.color, base.normal]
+        columns.append(base.opacity[:, None])
         out[part] = torch.cat(columns, -1)
     image = out.unflatten(0, (camera.height, camera.width)).cpu()
     if not image.isfinite().all():
@@ -80,8 +87,11 @@ def draw(
             "The avatar has colours or depths that are not finite, as after a training that diverged; train again with "
             "lower learning rates."
         )
-    color, opacity, depth, normal, bottom, bottom_normal = image.split([3, 1, 1, 3, 3, 3], -1)
-    return Picture(color.clamp(0, 1), opacity[..., 0], depth[..., 0], normal, bottom.clamp(0, 1), bottom_normal)
+    color, opacity, depth, normal, bottom, bottom_normal, bottom_opacity = image.split([3, 1, 1, 3, 3, 3, 1], -1)
+    return Picture(
+        color.clamp(0, 1), opacity[..., 0], depth[..., 0], normal, bottom.clamp(0, 1), bottom_normal,
+        bottom_opacity[..., 0] if has_base else None,
+    )  # fmt: skip
 
 
 def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
