@@ -19,6 +19,8 @@ def shrunk(recipe: Recipe) -> Recipe:
     if recipe.name.startswith("quick"):
         return replace(tiny_recipe(), name=recipe.name)
     method = recipe.method
+    if hasattr(method, "boxed"):
+        return shrunk_boxed(recipe)
     assert isinstance(method.field, FactorizedFieldConfig)
     # In float32, so that tolerances hold whatever the hardware is good at; `field` tests the other types.
     field = replace(method.field, width=72, high_sdf_depth=4, high_color_depth=2, hidden_dtype="float32")
@@ -29,6 +31,13 @@ def shrunk(recipe: Recipe) -> Recipe:
     losses = replace(method.losses, eikonal_points=32)
     pixels = replace(recipe.training.pixels, rays=64, patches=1, patch_size=16)
     method = replace(method, field=field, sampler=sampler, losses=losses)
+    return replace(recipe, method=method, training=replace(recipe.training, pixels=pixels))
+
+
+def shrunk_boxed(recipe: Recipe) -> Recipe:
+    """PM-Avatar, DANBO and NPC with few samples; their networks are the whole ones."""
+    method = replace(recipe.method, boxed=replace(recipe.method.boxed, coarse=12, fine=6, hidden_dtype="float32"))
+    pixels = replace(recipe.training.pixels, rays=64)
     return replace(recipe, method=method, training=replace(recipe.training, pixels=pixels))
 
 

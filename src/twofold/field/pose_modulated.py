@@ -98,7 +98,7 @@ class PoseModulatedField(nn.Module):
     def _first_linear(self, values: Tensor, joint: Tensor, sample: Tensor, samples: int) -> Tensor:
         """lin of the 24 joints' values side by side (zero where a box was left out), box by box."""
         layer = cast(nn.Linear, self.modulated[0])
-        by_joint = layer.weight.unflatten(1, (24, ENCODED))
+        by_joint = layer.weight.unflatten(1, (24, ENCODED)).unbind(1)
         counts = torch.bincount(joint, minlength=24).tolist()
-        parts = [part @ by_joint[:, j].T for j, part in enumerate(values.split(counts))]
+        parts = [part @ weight.T for part, weight in zip(values.split(counts), by_joint, strict=True)]
         return layer.bias.expand(samples, -1).index_add(0, sample, torch.cat(parts))

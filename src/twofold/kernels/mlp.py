@@ -78,6 +78,8 @@ class MLP(nn.Module):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
+        # Type that the layers between the first and the last compute in; None for that of the parameters.
+        self.hidden_dtype: torch.dtype | None = None
         if skip_layer is not None and not 0 < skip_layer < len(widths):
             raise ValueError(f"skip_layer={skip_layer} is no hidden layer after the first of {len(widths)}")
         self.inputs, self.constants = inputs, constants
@@ -117,8 +119,10 @@ class MLP(nn.Module):
             if index == 0 and constant is not None:
                 # The same product for all samples, so it is taken once and becomes part of the bias.
                 weight, bias = weight[:, given:], bias + weight[:, :given] @ constant
+            if index > 0 and self.hidden_dtype is not None:
+                h, weight, bias = (t.to(self.hidden_dtype) for t in (h, weight, bias))
             h = F.relu(F.linear(h, weight, bias))
-        return h
+        return h.to(x.dtype)
 
     def head(self, hidden: Float[Tensor, "S w"]) -> Float[Tensor, "S o"]:
         """The last layer alone."""

@@ -8,9 +8,10 @@ from typing import Any, cast
 from twofold.config import KIND, from_dict, to_dict, with_overrides
 from twofold.errors import TwofoldError
 from twofold.inputs import shown
-from twofold.methods import factorized_recipes
+from twofold.methods import factorized_recipes, pm_avatar
 from twofold.methods.base import MethodConfig
 from twofold.methods.factorized import FactorizedConfig
+from twofold.methods.pm_avatar import PmAvatarConfig
 from twofold.methods.stored import completed
 from twofold.recipe import Recipe, TrainingConfig
 
@@ -25,6 +26,7 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "factorized": Method(FactorizedConfig, factorized_recipes.RECIPES),
+    "pm_avatar": Method(PmAvatarConfig, pm_avatar.RECIPES),
 }
 """Every method by its name. A recipe stored without a kind is of the first."""
 
