@@ -1,7 +1,7 @@
 """Time to quality: PSNR over the subject's box on unseen views and poses against seconds of training.
 
 The reference form (paper-size networks, error-bounded sampler, autograd, float32) then trains for as many seconds. It
-takes minutes for a picture of ordinary size, so both are measured on small pictures of the same moments, too.
+takes minutes for an image of ordinary size, so both are measured on small images of the same frames, too.
 
 python -m benchmarks.quality [--threads 2] [--steps 1000] [--seed 0] [--size 192]
 """
@@ -27,7 +27,7 @@ from twofold.methods.factorized_recipes import demo_recipe
 from twofold.training import loop
 
 SMALL = 48
-"""Rows and columns of the pictures that the reference form is asked for."""
+"""Rows and columns of the images that the reference form is asked for."""
 
 
 class OutOfTime(Exception):
@@ -44,7 +44,7 @@ def figures(avatar: Avatar, capture: Capture, most: int) -> dict[str, float]:
 def train_reference(capture: Capture, small: Capture, seconds: float) -> dict[str, object]:
     """What the reference form reaches in some seconds; a step that has begun is finished."""
     recipe = reference()
-    # Without LPIPS patches teach nothing; two pictures of 1,728 rays fill 40 GB of memory.
+    # Without LPIPS patches teach nothing; two images of 1,728 rays fill 40 GB of memory.
     pixels = replace(recipe.training.pixels, patches=0)
     training = replace(recipe.training, images_per_step=1, pixels=pixels, preview_every=0)
     recipe = replace(recipe, training=training)

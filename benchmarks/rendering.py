@@ -1,6 +1,6 @@
-"""Seconds to render pictures of the demo's kind of avatar: quick and paper-size networks, 256 and 512 square.
+"""Seconds to render images of the demo's kind of avatar: quick and paper-size networks, 256 and 512 square.
 
-The reference form (error-bounded sampler, gradients by autograd) renders a small picture; its seconds for a large one
+The reference form (error-bounded sampler, gradients by autograd) renders a small image; its seconds for a large one
 are stated as rays times its seconds a ray, since it would take an hour.
 
     python -m benchmarks.rendering [--threads 2] [--steps 300]
@@ -29,7 +29,7 @@ from twofold.training.loop import train
 
 
 def seconds(avatar: Avatar, capture: Capture, size: int, repeats: int) -> dict[str, float]:
-    """Time of one picture from the training camera, posing included."""
+    """Time of one image from the training camera, posing included."""
     frame = capture.train[0]
     camera = frame.camera.resized(size, size)
     background = torch.tensor(capture.background)

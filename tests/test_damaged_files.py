@@ -221,7 +221,7 @@ def test_a_calibration_with_values_of_other_kinds_is_said_to_be_one(tmp_path: Pa
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve pictures of 48 x 64 in a folder."""
+    """Twelve images of 48 x 64 in a folder."""
     folder = tmp_path_factory.mktemp("clip") / "clip"
     folder.mkdir()
     for number in range(12):
@@ -261,7 +261,7 @@ def test_damaged_poses_are_said_to_be_so(damage: Callable[..., bytes], clip: Pat
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg", "webp", "tiff", "bmp"])
-def test_damaged_pictures_and_masks_are_said_to_be_so(ending: str, clip: Path, tmp_path: Path) -> None:
+def test_damaged_images_and_masks_are_said_to_be_so(ending: str, clip: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(clip, tmp_path / "clip")
     for path in folder.iterdir():
         path.rename(path.with_suffix(f".{ending}"))

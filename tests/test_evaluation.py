@@ -20,7 +20,7 @@ from twofold.training.run import load
 
 @pytest.fixture
 def capture(tmp_path):
-    """Two pictures of a red rectangle 20 x 12; a sixth of the first one's is ignored."""
+    """Two images of a red rectangle 20 x 12; a sixth of the first one's is ignored."""
     image, mask, layer = (np.zeros(shape, np.uint8) for shape in ((40, 32, 3), (40, 32), (40, 32)))
     image[10:30, 8:20], mask[10:30, 8:20], layer[10:14, 8:18] = (255, 0, 0), 255, 255
     for name, pixels in (("image", image), ("mask", mask), ("ignored", layer)):

@@ -74,10 +74,10 @@ def test_a_written_file_is_whole_and_alone(tmp_path):
 
 
 def test_the_temporary_name_keeps_the_ending_and_the_folder(tmp_path):
-    with write_atomically(tmp_path / "picture.png") as temporary:
+    with write_atomically(tmp_path / "image.png") as temporary:
         assert temporary.suffix == ".png"
         assert temporary.parent == tmp_path
-        assert not (tmp_path / "picture.png").exists()
+        assert not (tmp_path / "image.png").exists()
         temporary.write_bytes(b"x")
 
 

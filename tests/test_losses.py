@@ -102,7 +102,7 @@ def test_hard_mask_without_patches_or_without_one_side_is_the_mean_of_what_is_th
 
 
 def literal_s3im(color, truth, orders, center=1.5):
-    """Window by window over the virtual picture, borders of zeros, as the term is described."""
+    """Window by window over the virtual image, borders of zeros, as the term is described."""
     rays, order = len(color), [i for part in orders for i in part]
     height = math.isqrt(rays)
     width = len(order) // height

@@ -33,7 +33,7 @@ METRICS = {
     "novel_view": {
         "psnr_box": {"value": 27.3, "protocol": "over the box"},
         "each": [1.0, 2.0],
-        "pictures": 6,
+        "images": 6,
         "by_camera": {"left": 1728, "right": 0.5},
     },
     "geometry": {"chamfer_cm": {"value": None, "protocol": "no true mesh"}},
@@ -130,7 +130,7 @@ def test_page_shows_all_it_was_given(tmp_path: Path) -> None:
     assert page.all("video")[0]["src"] == "films/a%20turn.mp4"
 
 
-def test_pictures_are_inside_the_page_pixel_by_pixel(tmp_path: Path) -> None:
+def test_images_are_inside_the_page_pixel_by_pixel(tmp_path: Path) -> None:
     images = full_page(tmp_path).all("img")
     sources = [str(a["src"]) for a in images]
     contents = [base64.b64decode(s.removeprefix("data:image/png;base64,"), validate=True) for s in sources]
@@ -198,7 +198,7 @@ def test_verdicts_compare_with_their_goal() -> None:
         "x", "151", "s", "goal ≤ 180 s", True
     )
     assert key_metric(METRICS, "seconds.total", "x", "s", at_most=150.0).met is False
-    assert key_metric(METRICS, "novel_view.pictures", "x") == KeyMetric("x", "6.00", "", "", None)
+    assert key_metric(METRICS, "novel_view.images", "x") == KeyMetric("x", "6.00", "", "", None)
 
 
 @pytest.mark.parametrize("key", ["geometry.chamfer_cm", "geometry.nothing", "nothing.at.all", "novel_view", "recipe"])
@@ -214,7 +214,7 @@ def test_every_number_stands_beside_its_protocol() -> None:
         ("recipe", "quick", ""),
         ("Novel view",),
         ("psnr_box", "27.30", "over the box"),
-        ("pictures", "6", ""),
+        ("images", "6", ""),
         ("Novel view, by camera",),
         ("left", "1,728", ""),
         ("right", "0.5000", ""),

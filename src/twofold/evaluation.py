@@ -32,8 +32,8 @@ def draw_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) ->
 
 
 _REFINED = (
-    "as refined in training from the training pictures; a moment between two that were trained on takes the mean of "
-    "their corrections, nothing of its own picture"
+    "as refined in training from the training images; a frame between two that were trained on takes the mean of "
+    "their corrections, nothing of its own image"
 )
 
 
@@ -63,11 +63,11 @@ def measure_split(
     avatar: Avatar, capture: Capture, split: str, most: int | None = None, refined: bool = False,
     watch: Callable[[Frame, Picture], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
-    """Means of all picture figures over a split's frames.
+    """Means of all image figures over a split's frames.
 
     Args:
         avatar: to measure.
-        capture: with the true pictures.
+        capture: with the true images.
         split: "train", "novel_view" or "novel_pose".
         most: at most so many frames, evenly spread; None for all.
         refined: apply what training learned about the poses (`pose_at`).
@@ -95,7 +95,7 @@ def measure_split(
     protocol = {
         **image_metrics.PROTOCOLS,
         "frames": f"mean over {sampled(len(frames), len(capture.splits[split]), 'images')} of the split {split}: "
-        f"{times} moments, {cameras} cameras",
+        f"{times} frames, {cameras} cameras",
         "poses": poses,
         "background": f"constant {capture.background}",
     }
@@ -115,7 +115,7 @@ def measure_geometry(
     avatar: Avatar, capture: Capture, most: int | None = None, voxel: float = 0.008,
     watch: Callable[[], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
-    """Means of the surface figures over the moments whose true mesh is known; empty where none is."""
+    """Means of the surface figures over the frames whose true mesh is known; empty where none is."""
     rows = []
     for time, frame in _with_mesh(capture, most).items():
         posed = avatar.pose(frame.pose, frame.translation, None)
@@ -130,7 +130,7 @@ def measure_geometry(
         **shape_metrics.PROTOCOLS,
         "surface": f"marching cubes of the signed distance at {1000 * voxel:g} mm in canonical space, largest piece, "
         "posed by the 7 nearest body vertices",
-        "moments": f"mean over {sampled(len(rows), len(_with_mesh(capture, None)), 'moments with a true mesh')}",
+        "moments": f"mean over {sampled(len(rows), len(_with_mesh(capture, None)), 'frames with a true mesh')}",
     }
     return means
 
@@ -139,15 +139,15 @@ def measure_refinement(
     avatar: Avatar, capture: Capture, most: int, trained: dict[str, object] | None = None,
     watch: Callable[[Frame, Picture], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
-    """How far training moved the poses, and the same avatar in the poses before and after, in at most `most` pictures.
+    """How far training moved the poses, and the same avatar in the poses before and after, in at most `most` images.
 
-    Held-out moments are of the split "novel_pose"; without a training moment near them their poses stay as they are.
-    `trained` are the training pictures' figures in the poses after, where the caller has them already.
+    Held-out frames are of the split "novel_pose"; without a training frame near them their poses stay as they are.
+    `trained` are the training images' figures in the poses after, where the caller has them already.
     """
     found: dict[str, object] = dict(avatar.pose_corrections())
     told = {"shape": "length of the change of the coefficients"}
     for name, unit in (("root", "radians"), ("body", "radians"), ("translation", "metres")):
-        told[name] = f"root mean square change over the training moments, {unit}"
+        told[name] = f"root mean square change over the training frames, {unit}"
     poses = {"before": "the poses of the capture", "after": "the poses that training made of them"}
     for split, called, known in (("train", "train", trained), ("novel_pose", "held_out", None)):
         for when in poses:
@@ -155,7 +155,7 @@ def measure_refinement(
             figures = known if known and after else measure_split(avatar, capture, split, most, after, watch)
             for figure in ("psnr_box", "silhouette_iou") if figures else ():
                 found[f"{called}_{figure}_{when}"] = figures[figure]
-                told[f"{called}_{figure}_{when}"] = f"up to {most} pictures of the split {split} in {poses[when]}"
+                told[f"{called}_{figure}_{when}"] = f"up to {most} images of the split {split} in {poses[when]}"
     return found | {"protocol": told}
 
 
@@ -203,7 +203,7 @@ def measure(
         read_mesh(capture.meshes[time])  # before hours of work
     pictures = {name: len(spread(capture.splits.get(name, ()), most)) for name in ("novel_view", "novel_pose")}
     pictures["train"] = len(spread(capture.train, few))
-    # Training pictures are drawn once more, in the poses as given; held-out ones in both.
+    # Training images are drawn once more, in the poses as given; held-out ones in both.
     refined = pictures["train"] + 2 * min(pictures["novel_pose"], few) if _refines(avatar) else 0
     pieces = {**pictures, "pose refinement": refined, "geometry": len(_with_mesh(capture, meshes))}
     section = ""

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from twofold.config import require_within
 
 S3IM_REPEATS = 10
-"""Orders in which the rays are laid out in the virtual picture: as given, then permuted at random."""
+"""Orders in which the rays are laid out in the virtual image: as given, then permuted at random."""
 S3IM_WINDOW = 4
 """Pixels across the window of `s3im`, and between two windows."""
 S3IM_SIGMA = 1.5
@@ -46,7 +46,7 @@ class LossConfig:
     """Chance of each squared difference of features to be left out; 0.5 in the release."""
     lpips_off_box: Literal["black", "picture"] = "black"
     """What patches show where no ray meets the body's box: black on both sides, or, as released, the background where
-    the avatar is rendered and the picture where it is not."""
+    the avatar is rendered and the image where it is not."""
     mask: float = 0.1
     mask_form: Literal["sides", "mean", "hard"] = "sides"
     """"sides": inside and outside rays averaged apart, a pixel on the edge by its parts; "mean": plain mean; "hard": as
@@ -90,7 +90,7 @@ def reconstruction(
 
     Args:
         color: rendered, 0..1.
-        truth: of the picture, 0..1.
+        truth: of the image, 0..1.
         reduction: mean over rays and channels, as released, or sum, as printed.
     """
     difference = (color - truth).abs()
@@ -100,11 +100,11 @@ def reconstruction(
 def common(
     base_color: Float[Tensor, "R 3"], truth: Float[Tensor, "R 3"], reduction: Literal["mean", "sum"] = "mean"
 ) -> Float[Tensor, ""]:
-    """The same for the picture that the base branch renders alone (Eq. 11); it keeps that branch from idling.
+    """The same for the image that the base branch renders alone (Eq. 11); it keeps that branch from idling.
 
     Args:
         base_color: rendered from s1 and c1, 0..1.
-        truth: of the picture, 0..1.
+        truth: of the image, 0..1.
         reduction: as in `reconstruction`.
     """
     return reconstruction(base_color, truth, reduction)
@@ -192,15 +192,15 @@ def s3im(
     generator: torch.Generator,
     center: float = S3IM_CENTER,
 ) -> Float[Tensor, ""]:
-    """Structure beyond single pixels (S3IM, Xie et al. 2023): 1 - SSIM of a virtual picture made of unrelated rays.
+    """Structure beyond single pixels (S3IM, Xie et al. 2023): 1 - SSIM of a virtual image made of unrelated rays.
 
-    The rays, in order and then in nine random orders, fill the rows of a picture as high as the square root of their
+    The rays, in order and then in nine random orders, fill the rows of an image as high as the square root of their
     number (576 rays make 24 x 240). SSIM is taken in 4 x 4 Gaussian windows, 4 apart, with a border of one zero pixel.
     Fewer rays than fill a window have no structure; their loss is zero.
 
     Args:
         color: rendered, 0..1.
-        truth: of the picture, 0..1.
+        truth: of the image, 0..1.
         generator: draws the orders.
         center: middle of the Gaussian window, pixels from its first one of 0..3; the release has 2, off its centre.
     """
@@ -356,7 +356,7 @@ def _mean_over(values: Tensor, shares: Tensor) -> Tensor:
 
 
 def _windowed_ssim(first: Tensor, second: Tensor, center: float) -> Tensor:
-    """Structural similarity of pictures [n 1 h w] in each window; colours in 0..1."""
+    """Structural similarity of images [n 1 h w] in each window; colours in 0..1."""
     offsets = torch.arange(S3IM_WINDOW, dtype=first.dtype, device=first.device) - center
     bell = torch.exp(-offsets.square() / (2 * S3IM_SIGMA**2))
     window = (bell[:, None] * bell / bell.sum() ** 2)[None, None]

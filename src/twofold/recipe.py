@@ -8,7 +8,7 @@ from twofold.config import MOST_SEED, require_within
 
 @dataclass(frozen=True)
 class PixelConfig:
-    """How the rays of a step are chosen from a picture."""
+    """How the rays of a step are chosen from an image."""
 
     rays: int = 576
     """Single pixels, from the subject's box and around it."""
@@ -32,7 +32,7 @@ class PixelConfig:
     """Whether the same single pixel may be drawn twice; the release draws without replacement."""
 
     def __post_init__(self) -> None:
-        """Refuses choices with which no picture gives pixels, or more than any machine takes."""
+        """Refuses choices with which no image gives pixels, or more than any machine takes."""
         require_within(
             self, rays=(1, 1_000_000), subject_share=(0, 1), surroundings=(0, 10_000), patches=(0, 1000),
             patch_size=(1, 1024), patch_on_subject=(0, 1),
@@ -45,13 +45,13 @@ class TrainingConfig:
 
     steps: int = 200_000
     images_per_step: int = 2
-    """Pictures whose gradients are averaged; each of N processes takes an N-th of them."""
+    """Images whose gradients are averaged; each of N processes takes an N-th of them."""
     pixels: PixelConfig = PixelConfig()
     milestones: tuple[int, ...] = (200, 400)
-    """Epochs after which the rates are halved; an epoch sees every training picture once."""
+    """Epochs after which the rates are halved; an epoch sees every training image once."""
     epochs: Literal["images", "steps"] = "images"
-    """How long an epoch is: "images", as many pictures as there are, wherever in a step it ends; "steps", as released,
-    whole steps, the last one of which begins the pictures again where they do not come out even."""
+    """How long an epoch is: "images", as many images as there are, wherever in a step it ends; "steps", as released,
+    whole steps, the last one of which begins the images again where they do not come out even."""
     warmup: int = 0
     """Steps over which the rates rise from zero."""
     decay: float = 1.0
@@ -64,7 +64,7 @@ class TrainingConfig:
     """Largest global norm of the gradient; 0 for no limit."""
     checkpoint_every: int = 500
     preview_every: int = 1000
-    """Steps between two preview pictures; 0 for none."""
+    """Steps between two preview images; 0 for none."""
     compile: Literal["never", "auto", "always"] = "never"
     """Whether dense networks run compiled (torch.compile): "auto" on a GPU only. The first step then takes minutes."""
 

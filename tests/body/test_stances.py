@@ -92,7 +92,7 @@ def test_the_training_motion_shows_every_side(seed, rehearsed):
 @given(st.integers(0, 1000))
 def test_motion_is_smooth_and_within_what_joints_can_do(seed):
     poses, sway = choreograph(seed, 60, 16)
-    # From one moment to the next, a twelfth of a second, no limb flies off.
+    # From one frame to the next, a twelfth of a second, no limb flies off.
     assert np.abs(np.diff(poses[:60, 1:], axis=0)).max() < 0.75
     assert np.abs(sway).max() < 0.05
     assert (poses[:, [4, 5], 0] >= 0).all()
@@ -120,7 +120,7 @@ def test_the_same_seed_moves_the_same_and_another_does_not():
 
 
 @pytest.mark.parametrize(("rehearsed", "unrehearsed"), [(2, 1), (3, 1), (8, 2), (400, 100)])
-def test_any_number_of_moments_can_be_danced(rehearsed, unrehearsed):
+def test_any_number_of_frames_can_be_danced(rehearsed, unrehearsed):
     poses, sway = choreograph(0, rehearsed, unrehearsed)
     assert poses.shape == (rehearsed + unrehearsed, 24, 3)
     assert sway.shape == (rehearsed + unrehearsed, 2)

@@ -78,7 +78,7 @@ def test_the_same_input_gives_the_same_bytes(tiny, tmp_path):
     assert every_file(write_tiny(tmp_path / "again")) == every_file(tiny)
 
 
-def test_picture_files_are_taken_over_as_they_are(tmp_path, tiny):
+def test_image_files_are_taken_over_as_they_are(tmp_path, tiny):
     source = tmp_path / "source.JPG"
     Image.new("RGB", (48, 40), (90, 90, 90)).save(source, "JPEG")
     (tiny / "images/front/000001.png").unlink()
@@ -174,7 +174,7 @@ def test_nothing_but_a_capture_is_ever_overwritten(tiny, tmp_path):
 
 def test_reading_opens_no_pixels(tiny, monkeypatch):
     def no_pixels(*_):
-        raise AssertionError("a picture was decoded")
+        raise AssertionError("an image was decoded")
 
     monkeypatch.setattr("PIL.ImageFile.ImageFile.load", no_pixels)
     assert read_capture(tiny).name == "tiny"
@@ -196,7 +196,7 @@ def test_many_faults_are_listed_shortly(tiny, move):
 
 def test_one_fault_is_one_line(tiny):
     (tiny / "masks/front/000002.png").unlink()
-    with pytest.raises(TwofoldError, match="lacks the pictures of times 2;") as caught:
+    with pytest.raises(TwofoldError, match="lacks the images of times 2;") as caught:
         read_capture(tiny)
     assert len(str(caught.value).splitlines()) == 1
 

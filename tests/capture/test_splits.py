@@ -18,7 +18,7 @@ def test_images_leave_every_split_and_the_rest_stays(tmp_path):
     shown = {split: [(f.camera_name, f.time) for f in frames] for split, frames in capture.splits.items()}
     assert shown == {
         "train": [("front", 0), ("front", 1), ("front", 3)],
-        "novel_view": [("back", 0)],  # The other moment is not trained on any more
+        "novel_view": [("back", 0)],  # The other frame is not trained on any more
         "novel_pose": [("front", 4), ("front", 5)],
     }
     after = json.loads((folder / "capture.json").read_text())

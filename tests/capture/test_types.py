@@ -1,4 +1,4 @@
-"""Frames read their pictures when asked."""
+"""Frames read their images when asked."""
 
 import itertools
 
@@ -20,7 +20,7 @@ def test_a_frame_reads_colours_and_mask_as_shares_of_one(tiny):
     torch.testing.assert_close(image[mask == 0], torch.full((int((mask == 0).sum()), 3), 32 / 255))
 
 
-def test_a_grey_picture_and_a_bilevel_mask_are_read_as_well(tiny):
+def test_a_grey_image_and_a_bilevel_mask_are_read_as_well(tiny):
     frame = read_capture(tiny).train[0]
     Image.fromarray(np.full((40, 48), 51, np.uint8)).save(frame.image_file)
     with Image.open(frame.mask_file) as picture:
@@ -31,7 +31,7 @@ def test_a_grey_picture_and_a_bilevel_mask_are_read_as_well(tiny):
     torch.testing.assert_close(frame.mask(), before)
 
 
-def test_pictures_are_read_anew_each_time(tiny):
+def test_images_are_read_anew_each_time(tiny):
     """A long capture costs no memory: nothing is kept."""
     frame = read_capture(tiny).train[0]
     first = frame.image()

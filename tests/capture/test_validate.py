@@ -33,21 +33,21 @@ def only(faults):
     ("edit", "sentence"),
     [
         (lambda d: d.pop("name"), '"name" should be a text'),
-        (lambda d: d.update(fps=0), '"fps" should be moments per second above 0, up to 100000; it is 0'),
+        (lambda d: d.update(fps=0), '"fps" should be frames per second above 0, up to 100000; it is 0'),
         (lambda d: d.update(fps=None), '"fps" should be'),
         (lambda d: d.update(background=[0, 128, 255]), '"background" should be three numbers from 0 to 1'),
         (lambda d: d.update(credit=7), '"credit" should be a text'),
         (lambda d: d["splits"].update(test=[]), "there is no split 'test'"),
         (lambda d: d["splits"].update(train=[]), "the train split is empty"),
-        (lambda d: d["splits"].update(train=[{"camera": "front", "times": [0]}], novel_view=[]), "one moment only"),
+        (lambda d: d["splits"].update(train=[{"camera": "front", "times": [0]}], novel_view=[]), "one frame only"),
         (lambda d: d["splits"]["train"][0].update(times=[0, 2, 2]), "twice at times 2"),
         (lambda d: d["splits"]["train"][0].update(times=[0, 2, 3.5]), "whole numbers"),
         (lambda d: d["splits"]["train"].append({"camera": "front"}), 'should be a list of {"camera": name'),
         (lambda d: d["splits"].update(novel_pose={"front": [4]}), 'should be a list of {"camera": name'),
         (lambda d: d["splits"]["novel_view"].append({"camera": "top", "times": [0]}), "unknown camera 'top'"),
-        (lambda d: d["splits"]["novel_view"].append({"camera": "front", "times": [1]}), "training pictures at 1"),
-        (lambda d: d["splits"]["novel_view"].append({"camera": "back", "times": [5]}), "moments not trained on, 5"),
-        (lambda d: d["splits"]["novel_pose"].append({"camera": "back", "times": [2, 3]}), "training moments, 2-3"),
+        (lambda d: d["splits"]["novel_view"].append({"camera": "front", "times": [1]}), "training images at 1"),
+        (lambda d: d["splits"]["novel_view"].append({"camera": "back", "times": [5]}), "frames not trained on, 5"),
+        (lambda d: d["splits"]["novel_pose"].append({"camera": "back", "times": [2, 3]}), "training frames, 2-3"),
         (lambda d: d["splits"]["novel_pose"].append({"camera": "back", "times": [6, 7]}), "6-7, motion.npz ends at 5"),
         (lambda d: d["cameras"]["front"].update(height="40"), "height and width should be whole pixels"),
         (lambda d: d["cameras"]["front"].update(world_to_camera=[[1, 0], [0, 1]]), "4 rows of 4 finite numbers"),
@@ -67,7 +67,7 @@ def only(faults):
         ),
         (
             lambda d: d["cameras"]["back"]["intrinsics"][0].__setitem__(2, 900.0),
-            "outside the picture of camera back at times 0, 2, 4",
+            "outside the image of camera back at times 0, 2, 4",
         ),
     ],
 )
@@ -116,27 +116,27 @@ def test_a_damaged_body_or_motion_is_named_without_the_path_above(tiny):
     assert "body.npz is missing; correct the path, or make it again." in validate(tiny)
 
 
-def test_missing_pictures_are_named_by_camera(tiny):
+def test_missing_images_are_named_by_camera(tiny):
     for name in ("images/front/000001", "images/front/000002", "images/front/000005", "masks/back/000004"):
         (tiny / f"{name}.png").unlink()
     first, second = validate(tiny)
-    assert "images/front lacks the pictures of times 1-2, 5; add them (000001.png and so on)" in first
-    assert "masks/back lacks the pictures of times 4;" in second
+    assert "images/front lacks the images of times 1-2, 5; add them (000001.png and so on)" in first
+    assert "masks/back lacks the images of times 4;" in second
 
 
-def test_a_badly_numbered_picture_is_no_picture(tiny):
+def test_a_badly_numbered_image_is_no_image(tiny):
     (tiny / "images/front/000001.png").rename(tiny / "images/front/1.png")
-    assert "images/front lacks the pictures of times 1;" in only(validate(tiny))
+    assert "images/front lacks the images of times 1;" in only(validate(tiny))
 
 
-def test_unused_pictures_need_not_be_there(tiny, describe):
+def test_unused_images_need_not_be_there(tiny, describe):
     (tiny / "masks/front/000003.png").unlink()
     describe(lambda d: d["splits"]["train"][0].update(times=[0, 1, 2]))
     assert validate(tiny) == []
 
 
 @pytest.mark.parametrize("kind", ["images", "masks"])
-def test_a_wrong_sized_picture_is_named(tiny, kind):
+def test_a_wrong_sized_image_is_named(tiny, kind):
     with Image.open(tiny / f"{kind}/front/000001.png") as picture:
         smaller = picture.resize((20, 10))
     smaller.save(tiny / f"{kind}/front/000001.png")
@@ -144,7 +144,7 @@ def test_a_wrong_sized_picture_is_named(tiny, kind):
 
 
 @pytest.mark.parametrize(("kind", "mode"), [("masks", "RGB"), ("masks", "P"), ("images", "I;16"), ("images", "P")])
-def test_a_picture_of_the_wrong_kind_is_named(tiny, kind, mode):
+def test_an_image_of_the_wrong_kind_is_named(tiny, kind, mode):
     path = tiny / f"{kind}/front/000001.png"
     with Image.open(path) as picture:
         changed = picture.convert("I").convert("I;16") if mode == "I;16" else picture.convert(mode)
@@ -153,8 +153,8 @@ def test_a_picture_of_the_wrong_kind_is_named(tiny, kind, mode):
 
 
 @pytest.mark.parametrize("kind", ["images", "masks"])
-def test_an_unreadable_picture_is_named_once(tiny, kind):
-    (tiny / f"{kind}/front/000001.png").write_bytes(b"no picture at all")
+def test_an_unreadable_image_is_named_once(tiny, kind):
+    (tiny / f"{kind}/front/000001.png").write_bytes(b"no image at all")
     assert f"{kind}/front/000001.png is no image of a known kind (PNG, JPEG, WEBP, TIFF, BMP)" in only(validate(tiny))
     with pytest.raises(TwofoldError, match="no image of a known kind"):
         read_capture(tiny)
@@ -162,7 +162,7 @@ def test_an_unreadable_picture_is_named_once(tiny, kind):
 
 @pytest.mark.parametrize("kind", ["images", "masks"])
 @pytest.mark.parametrize("damage", ["truncated", "cut before its end mark", "one bit turned"])
-def test_a_damaged_picture_is_named(tiny, kind, damage):
+def test_a_damaged_image_is_named(tiny, kind, damage):
     buffer = io.BytesIO()
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
     Image.fromarray(noise if kind == "images" else noise[..., 0]).save(buffer, "PNG")

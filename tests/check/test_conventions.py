@@ -22,7 +22,7 @@ def samples(turner_read, turner_points):
 
 
 def spoilt(samples, change):
-    """Samples whose capture says something else, the pictures being the same."""
+    """Samples whose capture says something else, the images being the same."""
     placed = [replace(s.placed, **change(s.placed)) for s in samples]
     return [
         replace(s, placed=replace(p, points=posed_points(p.shaped, p.pose, p.translation)))
@@ -111,17 +111,17 @@ def test_a_measured_size_is_tried(samples):
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_mirrored_and_turned_pictures_are_recognised(samples, side):
+def test_mirrored_and_turned_images_are_recognised(samples, side):
     mirrored = [replace(s, mask=s.mask[:, ::-1], known=s.known[:, ::-1], to_window=_mirrored(s)) for s in samples]
-    assert [c.name for c in diagnose(mirrored).conventions] == ["pictures mirrored"]
+    assert [c.name for c in diagnose(mirrored).conventions] == ["images mirrored"]
     turned = [replace(s, mask=np.rot90(s.mask, side), known=np.rot90(s.known, side), to_window=_turned(s, side))
               for s in samples]  # fmt: skip
-    name = "pictures turned left" if side == 1 else "pictures turned right"
+    name = "images turned left" if side == 1 else "images turned right"
     assert [c.name for c in diagnose(turned).conventions] == [name]
 
 
 def _mirrored(sample):
-    """From pixels of a mirrored picture to pixels of a mirrored window."""
+    """From pixels of a mirrored image to pixels of a mirrored window."""
     picture = torch.tensor([[-1.0, 0, sample.placed.width - 1], [0, 1, 0], [0, 0, 1]])
     window = torch.tensor([[-1.0, 0, sample.mask.shape[1] - 1], [0, 1, 0], [0, 0, 1]])
     return window @ sample.to_window @ picture
@@ -163,7 +163,7 @@ def test_a_motion_that_is_early_or_late_is_found(turner_read, turner_points, lat
     assert (gain > 0.1, share > 0.9) == (late != 0, late != 0)
 
 
-def test_exchanged_pictures_are_found_and_right_ones_left(turner_read, turner_points):
+def test_exchanged_images_are_found_and_right_ones_left(turner_read, turner_points):
     poses, translations = motion()
     frames = list(turner_read.train[2:5])
     other = turner_read.train[14]

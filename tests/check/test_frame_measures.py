@@ -1,4 +1,4 @@
-"""Bodies in pictures: points on the skin, twins, windows, silhouettes, and what a picture tells."""
+"""Bodies in images: points on the skin, twins, windows, silhouettes, and what an image tells."""
 
 import math
 from dataclasses import replace
@@ -100,7 +100,7 @@ def test_a_splat_is_the_closing_of_its_points(generator):
     assert np.array_equal(splat(pixels, depth, 24, 20), closed)
 
 
-def test_a_window_shows_the_same_points_as_the_picture(turner_read):
+def test_a_window_shows_the_same_points_as_the_image(turner_read):
     frame = turner_read.train[0]
     mask = read_mask(frame)
     window = window_of(frame.camera, mask, torch.empty(0, 2), 40)
@@ -117,7 +117,7 @@ def test_a_window_shows_the_same_points_as_the_picture(turner_read):
     torch.testing.assert_close(here + 0.5, (there + 0.5 - torch.tensor([left, top])) * scale)
 
 
-def test_a_window_takes_the_shape_asked_for_as_far_as_the_picture_reaches(turner_read):
+def test_a_window_takes_the_shape_asked_for_as_far_as_the_image_reaches(turner_read):
     frame = turner_read.train[0]
     mask = np.zeros((96, 96), np.uint8)
     mask[30:50, 40:44] = 255

@@ -16,7 +16,7 @@ from twofold.geometry.cameras import project
 
 
 def filmed(turner_read, tmp_path, change):
-    """The first training frames with pictures changed by a function of their bytes and number."""
+    """The first training frames with images changed by a function of their bytes and number."""
     frames = []
     for number, frame in enumerate(turner_read.train[:4]):
         with Image.open(frame.image_file) as picture:

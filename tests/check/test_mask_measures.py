@@ -72,7 +72,7 @@ def test_borders_that_the_person_runs_into_are_named():
     assert mask_facts(one).borders == ()
 
 
-def test_an_inverted_mask_has_most_of_the_picture_and_its_border():
+def test_an_inverted_mask_has_most_of_the_image_and_its_border():
     facts = mask_facts(255 - disc(30.0))
     assert facts.share > 0.8
     assert facts.border_share > 0.95

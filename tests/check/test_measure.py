@@ -102,7 +102,7 @@ def test_a_page_cannot_take_the_place_of_a_file(turner, tmp_path, capsys):
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_sides_exchanged_in_some_moments_are_named(turner):
+def test_sides_exchanged_in_some_frames_are_named(turner):
     def exchange(arrays):
         poses = torch.from_numpy(arrays["poses"])
         return {"poses": torch.stack([mirrored_pose(p) if t in (6, 7, 8) else p for t, p in enumerate(poses)]).numpy()}
@@ -128,15 +128,15 @@ def test_splits_are_written_without_what_should_be_left_out(turner, capsys):
     assert "the splits stay as they are" in checked(capsys, turner, "--write-splits")[1]
 
 
-def test_pictures_of_other_moments_are_named(turner):
+def test_images_of_other_frames_are_named(turner):
     for kind in ("images", "masks"):
         one, other = (turner / kind / "front" / f"0000{t:02d}.png" for t in (3, 14))
         one.rename(turner / "x.png")
         other.rename(one)
         (turner / "x.png").rename(other)
     found = topics(turner)
-    assert found["exchanged pictures"].where == "camera front at 3, 14"
-    assert "3 shows the pose of 14, 14 shows the pose of 3" in found["exchanged pictures"].what
+    assert found["exchanged images"].where == "camera front at 3, 14"
+    assert "3 shows the pose of 14, 14 shows the pose of 3" in found["exchanged images"].what
     assert "bad frames" not in found
 
 
@@ -154,17 +154,17 @@ def test_one_camera_that_is_wrong_is_named(turner):
 def test_a_motion_that_is_late_is_named(turner):
     move(turner, lambda arrays: {k: np.roll(arrays[k], 2, 0) for k in ("poses", "translations")})
     found = topics(turner, most=20)
-    assert "2 moments later" in found["moments"].what
+    assert "2 frames later" in found["moments"].what
     assert "bad frames" not in found
 
 
-def test_the_same_picture_in_two_splits_or_twice_is_named(turner):
+def test_the_same_image_in_two_splits_or_twice_is_named(turner):
     images = turner / "images" / "front"
     for source, target in ((2, 21), (8, 9)):
         shutil.copy(images / f"0000{source:02d}.png", images / f"0000{target:02d}.png")
     found = topics(turner, most=2)
     assert found["overlap"].where == "camera front at 21"
-    assert found["repeated pictures"].where == "times 9"
+    assert found["repeated images"].where == "times 9"
 
 
 def test_numbers_are_plain_and_say_the_verdict(measured):
@@ -227,7 +227,7 @@ def test_overlays_tint_left_limbs_orange_and_right_ones_blue(turner_read, turner
     assert ((picture[..., :2].min(-1) > 170) & (picture[..., 2] < 150)).sum() > 50
 
 
-def test_faults_that_differ_in_their_moment_are_one():
+def test_faults_that_differ_in_their_frame_are_one():
     faults = ["masks/a/000001.png is bad.", "masks/a/000003.png is bad.", "masks/b/000003.png is bad.", "x lacks y."]
     assert alike(faults) == [
         "masks/a/000001.png is bad. (The same at times 3.)", "masks/b/000003.png is bad.", "x lacks y.",

@@ -1,4 +1,4 @@
-"""Motion without pictures: jumps, coverage, ranges."""
+"""Motion without images: jumps, coverage, ranges."""
 
 import itertools
 import math
@@ -41,7 +41,7 @@ def test_a_smooth_motion_has_no_jumps(facts):
     assert found.up > 0.99
 
 
-def test_a_moment_with_other_limbs_is_a_jump_and_its_neighbours_are_none(facts):
+def test_a_frame_with_other_limbs_is_a_jump_and_its_neighbours_are_none(facts):
     poses, translations = motion()
     poses[7, 16:20] += 1.5
     assert facts(poses).jumps == (7,)
@@ -127,7 +127,7 @@ def test_turning_once_round_shows_all_sides(facts):
     assert found.turned > 270
 
 
-def test_ranges_are_the_largest_turns_between_any_two_training_moments(facts):
+def test_ranges_are_the_largest_turns_between_any_two_training_frames(facts):
     poses, _ = motion()
     found = dict(zip((name for name, _ in LIMBS), facts().ranges, strict=True))
     for limb, joint, axis in (("left shoulder", "left_shoulder", 2), ("right knee", "right_knee", 0)):

@@ -72,7 +72,7 @@ CASES = {
     "pieces": ("warning", lambda f: masks(f, 3, loose=0.2)),
     "cropped": ("warning", lambda f: masks(f, 10, borders=("left",))),
     "sides unseen": ("warning", lambda f: moving(f, seen=200.0, unseen="back")),
-    "few pictures": ("warning", lambda f: replace(f, pictures=f.pictures | {"train": 12})),
+    "few images": ("warning", lambda f: replace(f, pictures=f.pictures | {"train": 12})),
     "poses": ("warning", lambda f: moving(f, poses=2)),
     "novel poses": ("note", lambda f: moving(f, novelty=3.0)),
     "up": ("note", lambda f: moving(f, up=0.1)),
@@ -81,7 +81,7 @@ CASES = {
     "moving camera": ("warning", lambda f: replace(f, backgrounds={"front": Background((1,), 0.05, (1.0,))})),
     "exposure": ("warning", lambda f: replace(f, backgrounds={"front": Background((1,), 0.0, (0.6,))})),
     "overlap": ("warning", lambda f: replace(f, twins=(("novel_view", "side", 4),))),
-    "repeated pictures": ("warning", lambda f: replace(f, repeated=(5,))),
+    "repeated images": ("warning", lambda f: replace(f, repeated=(5,))),
     "resolution": ("warning", lambda f: each(f, body_height=40.0)),
     "blur": ("note", lambda f: each(f, 1, sharpness=0.0)),
     "size": ("warning", lambda f: each(f, size_ratio=1.5)),
@@ -105,7 +105,7 @@ SERIOUS = {
     "scale": lambda f: replace(f, stature=1700.0),
     "inverted masks": lambda f: masks(f, share=0.9, border_share=1.0),
     "cropped": lambda f: each(masks(f, borders=("bottom",)), body_outside=0.5),
-    "few pictures": lambda f: replace(f, pictures=f.pictures | {"train": 5}),
+    "few images": lambda f: replace(f, pictures=f.pictures | {"train": 5}),
     "disagreement": lambda f: cameras(each(f, iou=0.4), iou=0.4),
     "jumps": lambda f: moving(f, jumps=tuple(range(20))),
     "moments": lambda f: replace(each(f, iou=0.5), moment=(-2, 0.3)),
@@ -184,15 +184,15 @@ def test_one_wrong_camera_is_named(good):
     assert found(replace(one, doubts=(doubt,)), "convention").where == f"camera {names[1]}"
 
 
-def test_exchanged_pictures_are_not_bad_frames_again(good):
+def test_exchanged_images_are_not_bad_frames_again(good):
     few = each(good, 2, iou=0.3)
     names = tuple((f.camera, f.time, other.time) for f, other in zip(few.frames[:2], few.frames[1::-1], strict=True))
     told = topics(replace(few, elsewhere=names))
-    assert "exchanged pictures" in told
+    assert "exchanged images" in told
     assert "bad frames" not in told
 
 
-def test_test_moments_that_jump_are_only_noted(good):
+def test_test_frames_that_jump_are_only_noted(good):
     finding = found(moving(good, jumps=(22,)), "jumps")
     assert (finding.level, finding.where) == ("note", "times 22")
 

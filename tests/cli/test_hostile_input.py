@@ -27,7 +27,7 @@ def without_pixels(path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["images", "masks"])
-def test_a_picture_without_pixels_ends_train_and_check_before_anything_is_written(
+def test_an_image_without_pixels_ends_train_and_check_before_anything_is_written(
     kind: str, person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capture = shutil.copytree(person_folder, tmp_path / "capture")
@@ -64,7 +64,7 @@ def test_a_full_disk_leaves_neither_numbers_nor_report_of_a_check(
 
 
 @pytest.mark.parametrize("part", ["views", "orbit"])
-def test_a_full_disk_leaves_no_empty_folder_of_pictures(
+def test_a_full_disk_leaves_no_empty_folder_of_images(
     part: str, trained: Run, person_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "a" / "out"
@@ -93,7 +93,7 @@ def test_a_diverged_run_is_neither_rendered_nor_measured(
     assert files(run) == before
 
 
-def test_a_picture_that_is_not_finite_is_not_shown(trained: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_that_is_not_finite_is_not_shown(trained: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     avatar, _ = load(trained.folder)
     posed = pose_canonically(avatar)
     camera = next(iter(orbit(posed, 24, 1)))

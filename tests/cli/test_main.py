@@ -232,7 +232,7 @@ def test_a_run_is_trained_drawn_and_measured_and_each_command_says_where_and_wha
 
 
 @pytest.mark.parametrize("size", [15, 100_000, -1])
-def test_pictures_of_no_size_and_of_more_than_memory_holds_are_refused(
+def test_images_of_no_size_and_of_more_than_memory_holds_are_refused(
     size: int, trained: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = refused(capsys, "render", trained.folder, "--out", tmp_path / "out", "--size", size)

@@ -76,7 +76,7 @@ def test_a_disk_that_is_full_at_the_start_gets_no_run(
 
 
 @pytest.mark.parametrize("what", ["canonical", "views", "orbit"])
-def test_a_full_disk_ends_drawing_without_half_a_picture(
+def test_a_full_disk_ends_drawing_without_half_an_image(
     what: str, trained: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with files_end_at(1000):

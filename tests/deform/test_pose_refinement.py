@@ -37,7 +37,7 @@ def test_it_starts_by_changing_nothing():
 
 
 @pytest.mark.parametrize("row", range(3))
-def test_each_moment_gets_its_own_correction(row):
+def test_each_frame_gets_its_own_correction(row):
     (pose, translation), module = some_pose(), refinement()
     corrected, moved = module(int(TIMES[row]), pose, translation)
     torch.testing.assert_close(corrected[0], pose[0] + module.root[row, 0])
@@ -46,7 +46,7 @@ def test_each_moment_gets_its_own_correction(row):
     torch.testing.assert_close(moved, translation + module.translation[row])
 
 
-def test_unknown_moments_stay_as_they_are():
+def test_unknown_frames_stay_as_they_are():
     pose, translation = some_pose()
     corrected, moved = refinement()(4, pose, translation)
     assert corrected is pose
@@ -64,7 +64,7 @@ def test_only_the_named_parts_learn(parts):
     assert {name for name, table in module.named_parameters() if table.requires_grad} == set(parts)
 
 
-def test_gradient_reaches_the_moment_alone():
+def test_gradient_reaches_the_frame_alone():
     (pose, translation), module = some_pose(), refinement()
     corrected, moved = module(7, pose, translation)
     ((2 * corrected).sum() + (3 * moved).sum()).backward()

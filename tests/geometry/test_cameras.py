@@ -52,7 +52,7 @@ def test_a_known_camera_sees_right_to_the_right_and_up_above():
 
 
 @pytest.mark.parametrize("factor", [2, 3, 4])
-def test_the_samples_of_a_larger_picture_lie_evenly_in_the_pixels_of_the_smaller(factor):
+def test_the_samples_of_a_larger_image_lie_evenly_in_the_pixels_of_the_smaller(factor):
     camera = make_camera(1)
     fine = camera.resized(camera.height * factor, camera.width * factor)
     through_fine = pixel_rays(fine, pixel_grid(fine))

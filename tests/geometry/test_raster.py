@@ -14,7 +14,7 @@ from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigi
 
 
 def front_camera(size=48, focal=60.0, distance=4.0):
-    """Stands on +z, looks back; its picture's middle is the origin."""
+    """Stands on +z, looks back; its image's middle is the origin."""
     world_to_camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
     world_to_camera[2, 3] = distance
     c = (size - 1) / 2

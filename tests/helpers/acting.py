@@ -1,4 +1,4 @@
-"""A body that acts before cameras, all of it known: motion, landmarks, masks, pictures."""
+"""A body that acts before cameras, all of it known: motion, landmarks, masks, images."""
 
 import dataclasses
 import functools
@@ -127,6 +127,6 @@ def joints_of(body, motion):
 
 
 def overlap(first, second):
-    """Intersection over union of masks, moment by moment."""
+    """Intersection over union of masks, frame by frame."""
     pairs = [(a > 127, b > 127) for a, b in zip(first, second, strict=True)]
     return np.array([(a & b).sum() / (a | b).sum() for a, b in pairs])

@@ -39,7 +39,7 @@ def validate_gltf(*files: Path) -> list[dict[str, Any]]:
 
 
 def load_in_browser(file: Path, times: list[float], every: int, profile: Path) -> dict[str, Any]:
-    """What `check.html` finds when Chromium loads a file with three.js; the picture of each time as a data URL.
+    """What `check.html` finds when Chromium loads a file with three.js; the image of each time as a data URL.
 
     Args:
         file: GLB or VRM.

@@ -99,7 +99,7 @@ def describe(folder: Path, change):
 
 
 def each_mask(folder: Path, change):
-    """Changes all masks by a function of their bytes and moment."""
+    """Changes all masks by a function of their bytes and frame."""
     for path in sorted((folder / "masks").rglob("*.png")):
         with Image.open(path) as picture:
             mask = np.array(picture)

@@ -11,7 +11,7 @@ from twofold.recipe import Recipe
 from twofold.sampling.error_bounded import ErrorBoundedSampler
 
 LATE = 20_006
-"""A step at which every schedule has begun and, of five moments, no zero pose is shown."""
+"""A step at which every schedule has begun and, of five frames, no zero pose is shown."""
 
 
 def shrunk(recipe: Recipe) -> Recipe:

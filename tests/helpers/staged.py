@@ -1,4 +1,4 @@
-"""A film set: somebody acts, is filmed into folders of pictures, and an estimator knows the truth about them."""
+"""A film set: somebody acts, is filmed into folders of images, and an estimator knows the truth about them."""
 
 from dataclasses import replace
 
@@ -48,11 +48,11 @@ class Stage:
         return self.folder / name
 
     def spoil(self, time, mask=None, name="cam0"):
-        """Another mask at some moment."""
+        """Another mask in some frame."""
         self.evidence[name].masks[time] = np.zeros((HEIGHT, WIDTH), np.uint8) if mask is None else mask
 
     def nobody(self, times, name="cam0"):
-        """Nobody is found at some moments."""
+        """Nobody is found in some frames."""
         for time in times:
             self.spoil(time, name=name)
             self.evidence[name].track.pixels[time] = np.nan

@@ -1,4 +1,4 @@
-"""A filmed person small enough to train on within a test: 48 x 48 pixels, seven moments, two cameras."""
+"""A filmed person small enough to train on within a test: 48 x 48 pixels, seven frames, two cameras."""
 
 import math
 from dataclasses import dataclass, replace

@@ -14,7 +14,7 @@ def subject(person):
     return Subject.of(person)
 
 
-def test_subject_has_every_training_moment_once_and_in_order(person):
+def test_subject_has_every_training_frame_once_and_in_order(person):
     doubled = replace(person, splits={**person.splits, "train": person.train[::-1] + person.train[:2]})
     subject = Subject.of(doubled)
     assert subject.times.tolist() == [0, 1, 2, 3, 4]

@@ -183,7 +183,7 @@ def test_the_same_seed_builds_the_same_avatar(recipe, subject):
     assert all(torch.equal(first[name], tensor) for name, tensor in second.items())
 
 
-def test_size_of_the_chunks_does_not_change_the_picture(avatar, recipe, posed, camera):
+def test_size_of_the_chunks_does_not_change_the_image(avatar, recipe, posed, camera):
     whole, pieces = (draw(avatar, posed, camera, BACKGROUND, size) for size in (None, 37))
     # As released, the error-bounded sampler goes on until all rays of a call are well enough known; depths of rays that
     # see next to nothing tell that most.
@@ -194,7 +194,7 @@ def test_size_of_the_chunks_does_not_change_the_picture(avatar, recipe, posed, c
 
 
 def change_by_moving(avatar, person, camera, turn: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-    """What changes in a picture when camera and body are turned and shifted together."""
+    """What changes in an image when camera and body are turned and shifted together."""
     frame = person.train[1]
     pelvis = (person.body.joints + person.body.joint_basis @ person.betas)[0]
     pose, translation = moved_pose(frame.pose, frame.translation, pelvis, turn, shift)

@@ -52,7 +52,7 @@ def test_density_scale_never_falls_below_its_floor(subject, form):
 
 
 @pytest.mark.parametrize(("epochs", "length"), [("moments", 5), ("training", 3)])
-def test_epochs_of_the_zero_pose_are_moments_or_those_of_the_training(subject, person, epochs, length):
+def test_epochs_of_the_zero_pose_are_frames_or_those_of_the_training(subject, person, epochs, length):
     pose = replace(QUICK.pose, epochs=epochs, zero_until=10, zero_every=3, drop=0.0)
     avatar = replace(QUICK, pose=pose).build(subject)
     frame = person.train[1]
@@ -62,7 +62,7 @@ def test_epochs_of_the_zero_pose_are_moments_or_those_of_the_training(subject, p
     assert shown == [step >= 10 and step // length % 3 != 0 for step in range(35)]
 
 
-def test_poses_are_corrected_from_the_given_step_on_and_only_in_training_moments(subject, person):
+def test_poses_are_corrected_from_the_given_step_on_and_only_in_training_frames(subject, person):
     avatar = replace(QUICK, pose=replace(QUICK.pose, refine_from=5)).build(subject)
     with torch.no_grad():
         avatar.refinement.translation[1] = torch.tensor([0.1, 0.0, 0.0])
@@ -114,7 +114,7 @@ def pictures(avatar, person):
     return draw(avatar, avatar.pose(frame.pose, frame.translation), frame.camera.resized(32, 32), BLACK)
 
 
-def test_error_bounded_and_shell_sampler_draw_the_same_picture(trained, person):
+def test_error_bounded_and_shell_sampler_draw_the_same_image(trained, person):
     """Within one step of 8 bits on average and twelve at any pixel, where both end at the same distance."""
     shell = ShellSampler(radius=0.06, step=0.004, voxel=0.02, min_weight=0.0)
     bounded = ErrorBoundedSampler(ends="ray")

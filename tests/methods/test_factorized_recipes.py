@@ -116,7 +116,7 @@ def test_every_recipe_is_called_by_its_name_and_reads_back_from_json(name):
 
 @pytest.mark.parametrize("name", ABLATIONS)
 @pytest.mark.parametrize("start", [quick, released])
-def test_ablations_change_what_they_name_and_leave_the_common_loss_out_where_one_picture_is_left(name, start):
+def test_ablations_change_what_they_name_and_leave_the_common_loss_out_where_one_image_is_left(name, start):
     changed, full = settings(ablation(name, start())), settings(start())
     different = {key: changed[key] for key in full if changed[key] != full[key]} | {"name": changed["name"]}
     field = {f"method.field.{key}": value for key, value in ABLATIONS[name].items()}

@@ -67,7 +67,7 @@ def test_points_drawn_with_replacement_repeat():
     assert len(points_near(VERTICES, config, seeded()).unique(dim=0)) < 512
 
 
-def test_patches_of_the_release_show_background_and_picture_where_no_ray_goes():
+def test_patches_of_the_release_show_background_and_image_where_no_ray_goes():
     batch = a_batch()
     color = a_rendering(batch).color
     rendered, true = patch_pair(CONFIG, color, batch)

@@ -137,7 +137,7 @@ def test_canonical_vertices_of_normals_follow_the_shape_at_each_validation_and_a
     assert torch.equal(avatar.pose(start, start[0]).own.anchors, avatar.canonical_points), "tests begin anew"
 
 
-def test_tests_have_the_shape_as_given_and_training_moments_the_corrected_one(avatar, person):
+def test_tests_have_the_shape_as_given_and_training_frames_the_corrected_one(avatar, person):
     frame = person.train[1]
     given = pose_body(shape_body(person.body, person.betas), frame.pose, frame.translation)
     with torch.no_grad():

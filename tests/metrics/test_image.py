@@ -26,7 +26,7 @@ from twofold.metrics.image import (
 
 
 def pair(seed: int, height: int = 40, width: int = 33, noise: float = 0.1) -> tuple[Tensor, Tensor]:
-    """A smooth picture and a noisy copy that leaves 0..1 in places."""
+    """A smooth image and a noisy copy that leaves 0..1 in places."""
     generator = torch.Generator().manual_seed(seed)
     rows, columns = torch.meshgrid(torch.linspace(0, 3, height), torch.linspace(0, 4, width), indexing="ij")
     truth = torch.stack([rows.sin(), (rows * columns).cos(), columns / 3], -1) * 0.5 + 0.5
@@ -45,7 +45,7 @@ def test_ssim_equals_scikit_image(noise: float, data_range: float) -> None:
     assert ssim(image, truth, data_range) == pytest.approx(float(theirs), abs=1e-9)
 
 
-def test_ssim_of_flat_pictures_equals_scikit_image() -> None:
+def test_ssim_of_flat_images_equals_scikit_image() -> None:
     image, truth = torch.full((9, 7, 3), 0.2), torch.full((9, 7, 3), 0.7)
     theirs = structural_similarity(as_stored(truth), as_stored(image), data_range=1.0, channel_axis=-1)
     assert ssim(image, truth) == pytest.approx(float(theirs), abs=1e-9)
@@ -63,7 +63,7 @@ def test_psnr_of_a_constant_error_is_the_closed_form() -> None:
     assert psnr(truth + 10 / 255, truth) == pytest.approx(20 * math.log10(25.5), abs=1e-6)
 
 
-def test_equal_pictures_stay_finite_and_rounding_comes_before_comparing() -> None:
+def test_equal_images_stay_finite_and_rounding_comes_before_comparing() -> None:
     truth = torch.full((8, 8, 3), 0.4)
     assert psnr(truth, truth) == PSNR_CEILING
     assert psnr(truth + 0.3 / 255, truth) == PSNR_CEILING
@@ -79,7 +79,7 @@ def test_psnr_looks_only_inside_its_mask() -> None:
     assert psnr(spoilt, truth) < psnr(spoilt, truth, mask)
 
 
-def test_box_bounds_the_mask_and_stays_in_the_picture() -> None:
+def test_box_bounds_the_mask_and_stays_in_the_image() -> None:
     mask = torch.zeros(20, 30)
     mask[4, 25], mask[9, 7], mask[15, 2] = 0.51, 1.0, 0.5
     assert subject_box(mask) == (slice(4, 10), slice(7, 26))
@@ -106,7 +106,7 @@ def test_silhouette_overlap_by_counting() -> None:
     assert silhouette_iou(torch.zeros(3, 3), torch.zeros(3, 3)) == 1.0
 
 
-def test_too_small_a_picture_is_one_clear_sentence() -> None:
+def test_too_small_an_image_is_one_clear_sentence() -> None:
     image, truth = pair(4, 6, 20)
     with pytest.raises(TwofoldError, match="at least 7x7 pixels, it got 6x20"):
         ssim(image, truth)

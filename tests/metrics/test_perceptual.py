@@ -46,7 +46,7 @@ def folder(published, tmp_path_factory):
 
 
 def literal_lpips(first, second, vgg, linear, kept=None):
-    """Layer by layer through torchvision's numbering, one picture at a time; `kept` is what a dropout of half keeps."""
+    """Layer by layer through torchvision's numbering, one image at a time; `kept` is what a dropout of half keeps."""
 
     def features(picture):
         shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
@@ -99,14 +99,14 @@ def small():
     return model
 
 
-def test_distance_is_symmetric_and_zero_only_for_equal_pictures():
+def test_distance_is_symmetric_and_zero_only_for_equal_images():
     model, first, second = small(), torch.rand(3, 3, 16, 16), torch.rand(3, 3, 16, 16)
     torch.testing.assert_close(model(first, second), model(second, first))
     assert (model(first, second) > 0).all()
     assert (model(first, first) == 0).all()
 
 
-def test_gradients_reach_the_pictures_and_not_the_weights():
+def test_gradients_reach_the_images_and_not_the_weights():
     model = small().double()
     first, second = torch.rand(1, 3, 16, 16, dtype=torch.float64).requires_grad_(), torch.rand(1, 3, 16, 16).double()
     model(first, second).sum().backward()
@@ -114,7 +114,7 @@ def test_gradients_reach_the_pictures_and_not_the_weights():
     assert all(not p.requires_grad for p in model.parameters())
 
 
-def test_pictures_without_features_have_zero_distance_and_finite_gradients():
+def test_images_without_features_have_zero_distance_and_finite_gradients():
     model = small()
     for convolution in model.blocks.modules():
         if isinstance(convolution, torch.nn.Conv2d):
@@ -126,7 +126,7 @@ def test_pictures_without_features_have_zero_distance_and_finite_gradients():
     assert first.grad.isfinite().all()
 
 
-def test_small_pictures_are_refused():
+def test_small_images_are_refused():
     with pytest.raises(ValueError, match="16 x 16"):
         small()(torch.zeros(1, 3, 8, 32), torch.zeros(1, 3, 8, 32))
 

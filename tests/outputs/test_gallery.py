@@ -11,7 +11,7 @@ from twofold.outputs.gallery import render_run, shown_truth
 from twofold.training.run import load
 
 
-def test_ignored_pixels_are_hatched_and_the_rest_is_the_picture_on_the_background(tmp_path):
+def test_ignored_pixels_are_hatched_and_the_rest_is_the_image_on_the_background(tmp_path):
     image, mask, layer = (np.zeros(shape, np.uint8) for shape in ((20, 24, 3), (20, 24), (20, 24)))
     image[:], mask[5:15], layer[8:18, 4:20] = (255, 0, 0), 255, 255
     for name, pixels in (("image", image), ("mask", mask), ("ignored", layer)):

@@ -30,7 +30,7 @@ def slow(character: Character, view: Camera, samples: int) -> tuple[torch.Tensor
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3])
-def test_picture_is_that_of_the_slow_rasterizer(samples: int) -> None:
+def test_image_is_that_of_the_slow_rasterizer(samples: int) -> None:
     character = small_character(texture=0)
     found = draw_mesh(character, character.vertices, camera(), BACKGROUND, samples)
     color, opacity = slow(character, camera(), samples)

@@ -1,4 +1,4 @@
-"""Contact sheets hold every picture unaltered in its place; made-up colours mean what they say."""
+"""Contact sheets hold every image unaltered in its place; made-up colours mean what they say."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def noise(seed: int, height: int = 40, width: int = 30) -> np.ndarray:
 
 
 def place(page: np.ndarray, picture: np.ndarray) -> tuple[int, int]:
-    """Row and column of the one place where the page shows exactly this picture."""
+    """Row and column of the one place where the page shows exactly this image."""
     height, width = picture.shape[:2]
     windows = np.lib.stride_tricks.sliding_window_view(page, (height, width, 3))[:, :, 0]
     hits = np.argwhere((windows[..., 0, 0, :] == picture[0, 0]).all(-1))
@@ -23,7 +23,7 @@ def place(page: np.ndarray, picture: np.ndarray) -> tuple[int, int]:
     return found[0]
 
 
-def test_every_picture_stands_in_its_row_and_column() -> None:
+def test_every_image_stands_in_its_row_and_column() -> None:
     pictures = [[noise(3 * i + j) for j in range(3)] for i in range(2)]
     page = sheet(pictures, ["first", "a second one"], ["truth", "full", "base"], title="Seed 7", footer="By nobody")
     places = np.array([[place(page, p) for p in row] for row in pictures])
@@ -37,7 +37,7 @@ def ink(page: np.ndarray) -> int:
     return int((page < 128).all(-1).sum())
 
 
-def test_labels_are_written_beside_the_pictures_not_over_them() -> None:
+def test_labels_are_written_beside_the_images_not_over_them() -> None:
     white = np.full((60, 60, 3), 255, dtype=np.uint8)
     rows = [[white, white]]
     assert ink(sheet(rows)) == 0
@@ -45,19 +45,19 @@ def test_labels_are_written_beside_the_pictures_not_over_them() -> None:
     assert ink(sheet(rows, column_labels=["truth", "full"])) > 20
     assert ink(sheet(rows, title="Title")) > 20
     picture = noise(1)
-    place(sheet([[picture]], ["a very long label that has to be broken"], ["wider than its picture"]), picture)
+    place(sheet([[picture]], ["a very long label that has to be broken"], ["wider than its image"]), picture)
 
 
 def test_text_is_never_cut_off() -> None:
     page = sheet(
-        [[noise(1)]], ["left label"], ["wider than its picture"], "A title wider than the whole page", "words " * 30
+        [[noise(1)]], ["left label"], ["wider than its image"], "A title wider than the whole page", "words " * 30
     )
     assert (page[:10] == 255).all()
     assert (page[-10:] == 255).all()
     assert (page[:, :10] == 255).all()
     assert (page[:, -10:] == 255).all()
     narrow = [noise(1), noise(2)]
-    labelled = sheet([narrow], column_labels=["wider than its picture", "wider than its picture"])
+    labelled = sheet([narrow], column_labels=["wider than its image", "wider than its image"])
     apart = place(labelled, narrow[1])[1] - place(labelled, narrow[0])[1]
     assert apart > place(sheet([narrow]), narrow[1])[1] - place(sheet([narrow]), narrow[0])[1] + 60
 
@@ -71,7 +71,7 @@ def test_empty_places_and_short_rows_stay_white() -> None:
     assert (page[second_row : second_row + 40, left + 30 :] == 255).all()
 
 
-def test_pictures_of_other_sizes_are_brought_to_one_height() -> None:
+def test_images_of_other_sizes_are_brought_to_one_height() -> None:
     page = sheet([[noise(1, 80, 60), noise(2, 40, 60)]], height=40)
     place(page, noise(2, 40, 60))
     occupied = np.flatnonzero((page < 255).any((1, 2)))
@@ -87,7 +87,7 @@ def test_floats_are_stored_as_a_png_would() -> None:
 
 
 def test_wrong_tables_are_refused() -> None:
-    with pytest.raises(ValueError, match="at least one picture"):
+    with pytest.raises(ValueError, match="at least one image"):
         sheet([[None]])
     with pytest.raises(ValueError, match="1 rows, but 2 row labels"):
         sheet([[noise(1)]], ["a", "b"])

@@ -1,4 +1,4 @@
-"""Pictures: every ray where it belongs, and cameras that keep the person in view."""
+"""Images: every ray where it belongs, and cameras that keep the person in view."""
 
 import builtins
 import math
@@ -35,7 +35,7 @@ class Painted(Avatar):
         return as_avatar(pose_body(SHAPED, pose, translation))
 
     def render(self, rays, posed, background, mode=EVALUATION, generator=None):
-        assert generator is None, "pictures have no noise"
+        assert generator is None, "images have no noise"
         assert not torch.is_grad_enabled()
         self.asked.append(rays)
         color = 0.7 + 0.5 * rays.directions
@@ -128,7 +128,7 @@ def test_residual_is_what_the_base_lacks():
     assert not alone.residual.any()
 
 
-def test_pictures_come_back_from_the_device(device):
+def test_images_come_back_from_the_device(device):
     posed = Painted().pose(*some_pose())
     expected = draw(Painted(), posed, side_camera(posed), BACKGROUND)
     shaped = type(SHAPED)(**{name: tensor.to(device) for name, tensor in vars(SHAPED).items()})

@@ -1,4 +1,4 @@
-"""Prepared captures stand in the folder as they stood in the pictures."""
+"""Prepared captures stand in the folder as they stood in the images."""
 
 import json
 import os
@@ -115,7 +115,7 @@ def test_the_body_is_in_the_t_pose_and_the_world_is_y_up(imported):
     left_arm, right_arm = joints[20] - joints[16], joints[21] - joints[17]
     assert left_arm[0] / left_arm.norm() > 0.98
     assert right_arm[0] / right_arm.norm() < -0.98
-    for frame in capture.train:  # the arms still hang in the pictures, so now the poses lower them
+    for frame in capture.train:  # the arms still hang in the images, so now the poses lower them
         assert frame.pose[16, 2] < -0.5
         assert frame.pose[17, 2] > 0.5
     for frame in capture.train:
@@ -136,7 +136,7 @@ def test_origin_and_flawlessness(imported):
     assert validate(imported) == []
 
 
-def test_pictures_are_taken_over_bit_by_bit(prepared, imported):
+def test_images_are_taken_over_bit_by_bit(prepared, imported):
     assert (imported / "images/cam/000007.jpg").read_bytes() == (prepared / "images/0007.jpg").read_bytes()
     assert (imported / "masks/cam/000007.png").read_bytes() == (prepared / "masks/0007.png").read_bytes()
 
@@ -152,7 +152,7 @@ def test_badly_fitted_frames_are_left_out_and_recorded(prepared, tmp_path):
     assert not (tmp_path / "out/images/cam/000007.jpg").exists()
 
 
-def test_turning_the_world_changes_no_picture():
+def test_turning_the_world_changes_no_image():
     random = torch.Generator().manual_seed(0)
     body = shape_body(stick_body(), torch.zeros(1))
     poses, translations = torch.randn(3, 24, 3, generator=random), torch.randn(3, 3, generator=random)
@@ -173,7 +173,7 @@ def test_turning_the_world_changes_no_picture():
 
 
 def broken(prepared, tmp_path, **changes):
-    """A prepared folder with other arrays (None: without), its pictures linked."""
+    """A prepared folder with other arrays (None: without), its images linked."""
     folder = tmp_path / "broken"
     folder.mkdir()
     for kind in ("images", "masks"):
@@ -198,7 +198,7 @@ def broken(prepared, tmp_path, **changes):
         ({"world_to_camera": np.diag([1.0, 1, -1, 1])}, "mirrors the world"),
         ({"silhouette_iou": np.zeros(FRAMES)}, "Fewer than two frames .* the best reaches 0.00"),
         ({"poses": np.zeros((30, 24, 3)), "transl": np.zeros((30, 3)), "silhouette_iou": None, "video_frame": None},
-         "images lacks the pictures of frames 23-29"),
+         "images lacks the images of frames 23-29"),
         ({"transl": np.full((FRAMES, 3), [0, 0, -3.5])}, "has the body behind it at times 0-22"),
     ],
 )  # fmt: skip
@@ -211,7 +211,7 @@ def test_a_faulty_prepared_capture_is_one_sentence_and_leaves_nothing(prepared, 
 
 
 def no_picture(file):
-    file.write_bytes(b"no picture")
+    file.write_bytes(b"no image")
 
 
 def nobody(file):
@@ -228,7 +228,7 @@ def nobody(file):
         ("masks/0003.png", nobody, "is all black, so nobody is there"),
     ],
 )
-def test_a_bad_picture_is_named_as_it_was_given(prepared, tmp_path, name, spoil, sentence, held_objects):
+def test_a_bad_image_is_named_as_it_was_given(prepared, tmp_path, name, spoil, sentence, held_objects):
     folder = shutil.copytree(prepared, tmp_path / "given")
     spoil(folder / name)
     with pytest.raises(TwofoldError, match=sentence) as caught:

@@ -49,7 +49,7 @@ def test_a_clip_becomes_a_capture(tmp_path, monkeypatch):
     assert done.kept == tuple(range(14))
     assert done.mean("iou") > 0.85
     assert done.mean("reprojection") < 2
-    assert f"14 of 14 moments, silhouette IoU {done.mean('iou'):.2f}" in done.summary()
+    assert f"14 of 14 frames, silhouette IoU {done.mean('iou'):.2f}" in done.summary()
     joints, contents = motion_of(tmp_path / "me")
     assert (contents.name, contents.credit, contents.fps) == ("me", "me", FPS)
     # They stand on the floor in the middle of a world with y up, and where they were seen.
@@ -65,12 +65,12 @@ def test_a_clip_becomes_a_capture(tmp_path, monkeypatch):
     assert shares == sorted(shares)
     assert shares[-1] == 1
     assert [what for _, what in told][-1] == "done"
-    assert {"looking at the pictures", "fitting the body", "judging the fit"} <= {what for _, what in told}
+    assert {"looking at the images", "fitting the body", "judging the fit"} <= {what for _, what in told}
     assert all(finder.closed for finder in stage.finders)
     assert names(tmp_path) == ["clips", "me"]
 
 
-def test_the_world_is_turned_but_no_picture_changes(tmp_path, monkeypatch):
+def test_the_world_is_turned_but_no_image_changes(tmp_path, monkeypatch):
     stage = Stage(tmp_path / "clips")
     stage.is_understood(monkeypatch)
     stage.prepare(tmp_path / "me")
@@ -87,7 +87,7 @@ def test_the_world_is_turned_but_no_picture_changes(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("every", "held_out"), [(10, [5, 15]), (3, [1, 4, 7, 10, 13, 16, 19, 22])])
-def test_every_tenth_moment_is_held_out_between_two_that_train(tmp_path, monkeypatch, every, held_out):
+def test_every_tenth_frame_is_held_out_between_two_that_train(tmp_path, monkeypatch, every, held_out):
     stage = Stage(tmp_path / "clips", 24)
     stage.is_understood(monkeypatch)
     stage.prepare(tmp_path / "me", replace(PLAIN, held_out=every))
@@ -136,7 +136,7 @@ def test_clips_that_end_a_little_apart_are_cut(tmp_path, monkeypatch):
     assert validate(tmp_path / "me") == []
 
 
-def test_bad_moments_are_left_out_and_listed(tmp_path, monkeypatch):
+def test_bad_frames_are_left_out_and_listed(tmp_path, monkeypatch):
     stage = Stage(tmp_path / "clips", 24)
     stage.spoil(7, np.roll(stage.evidence["cam0"].masks[7], 60, 1))
     stage.spoil(8, np.roll(stage.evidence["cam0"].masks[8], 60, 1))
@@ -145,7 +145,7 @@ def test_bad_moments_are_left_out_and_listed(tmp_path, monkeypatch):
     done = stage.prepare(tmp_path / "me")
     kept = [t for t in range(24) if t not in (7, 8, 12)]
     assert done.kept == tuple(kept)
-    assert "3 moments were left out: 7-8 (the body does not cover the mask); 12 (nobody was found)." in done.warnings
+    assert "3 frames were left out: 7-8 (the body does not cover the mask); 12 (nobody was found)." in done.warnings
     notes, splits = notes_of(tmp_path / "me"), splits_of(tmp_path / "me")
     assert notes["left_out"] == [7, 8, 12]
     assert notes["warnings"] == list(done.warnings)
@@ -193,7 +193,7 @@ def test_objects_leave_the_mask_and_are_stored_as_ignored(tmp_path, monkeypatch)
     done = stage.prepare(tmp_path / "me", PrepareConfig(held_objects="remove"))
     assert notes_of(tmp_path / "me")["objects_ignored"] == {"cam0": [5, 6, 7]}
     assert names(tmp_path / "me" / "ignored" / "cam0") == ["000005.png", "000006.png", "000007.png"]
-    assert "Held objects were taken out in 3 of 14 pictures, at most" in done.summary()
+    assert "Held objects were taken out in 3 of 14 images, at most" in done.summary()
     assert validate(tmp_path / "me") == []
 
 
@@ -290,7 +290,7 @@ def test_dropped_frames_are_in_no_split_and_listed_with_the_reason(tmp_path, mon
     done = stage.prepare(tmp_path / "me", replace(PLAIN, drop=(2, 7)))
     assert {2, 7}.isdisjoint(done.kept)
     assert len(done.kept) == 12
-    assert "2 moments were left out: 2, 7 (asked for with --drop)." in done.warnings
+    assert "2 frames were left out: 2, 7 (asked for with --drop)." in done.warnings
     assert notes_of(tmp_path / "me")["left_out_because"] == {"2": "asked for with --drop", "7": "asked for with --drop"}
 
 
@@ -302,4 +302,4 @@ def test_images_that_repeat_are_left_out(tmp_path, monkeypatch):
     shutil.copy(stage.clips[0] / "012.png", stage.clips[0] / "013.png")
     done = stage.prepare(tmp_path / "me")
     assert done.kept == tuple(range(13))
-    assert "cam0: 1 pictures equal the one before them and are left out." in done.warnings
+    assert "cam0: 1 images equal the one before them and are left out." in done.warnings

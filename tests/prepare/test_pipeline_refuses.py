@@ -31,21 +31,21 @@ def cut_off(stage):
 
 
 def damaged(stage):
-    (stage.clips[0] / "009.png").write_bytes(b"no picture")
+    (stage.clips[0] / "009.png").write_bytes(b"no image")
 
 
 FAILURES = [
-    (too_short, {}, "has 5 pictures, expected at least 12"),
+    (too_short, {}, "has 5 images, expected at least 12"),
     (lambda stage: stage.nobody(range(14)), {}, "shows nobody; film one whole person"),
-    (lambda stage: stage.nobody(range(5)), {}, "shows a person in only 64 % of the pictures"),
-    (half_bad, {}, "6 of 14 pictures of cam0 could not be understood (moments 2-7); at 2, for one, the body does not"),
-    (cut_off, {}, "of cam0 head, hands or feet are beyond the picture's edge"),
+    (lambda stage: stage.nobody(range(5)), {}, "shows a person in only 64 % of the images"),
+    (half_bad, {}, "6 of 14 images of cam0 could not be understood (frames 2-7); at 2, for one, the body does not"),
+    (cut_off, {}, "of cam0 head, hands or feet are beyond the image's edge"),
     (damaged, {}, "009.png is"),
     (lambda stage: None, {"train_camera": "side"}, "--train-camera side is none of the clips; they are cam0."),
     (lambda stage: None, {"drop": (3, 14)}, "--drop names frame 14, and cam0 has 14, counted from 0"),
     (lambda stage: None, {"person": "masks"}, "give them with --masks, too"),
     (lambda stage: None, {"person": 0}, "--person counts people from the left, from 1; it is 0"),
-    (lambda stage: None, {"held_out": 1}, "One moment of 1 cannot be held out"),
+    (lambda stage: None, {"held_out": 1}, "One frame of 1 cannot be held out"),
     (lambda stage: stage.clips.append(stage.clips[0]), {}, "2 videos were given, which need --calibration"),
     (lambda stage: stage.clips.clear(), {}, "none was given"),
     (lambda stage: stage.clips.__setitem__(0, stage.folder / "gone.mp4"), {}, "gone.mp4 does not exist"),
@@ -134,7 +134,7 @@ def test_several_people_are_refused_unless_told_otherwise(tmp_path, monkeypatch,
         stage.prepare(tmp_path / "me", config, people=crowd)
         assert not shown
         return
-    with pytest.raises(TwofoldError, match="shows several people of about the same size in 100 % of its pictures"):
+    with pytest.raises(TwofoldError, match="shows several people of about the same size in 100 % of its images"):
         stage.prepare(tmp_path / "me", config, people=crowd)
     assert len(shown) >= 12
     assert names(tmp_path) == ["clips"]

@@ -53,7 +53,7 @@ def looking(dense, person, monkeypatch):
     dense._sampler.config = config
 
 
-def test_pictures_are_the_same_with_a_table(looking):
+def test_images_are_the_same_with_a_table(looking):
     (plain, many, _), (tabled, _, posed) = looking(0.0), looking(0.03)
     assert 0.1 < plain.opacity.mean() < 0.9
     for name in ("color", "opacity", "depth", "normal"):
@@ -111,7 +111,7 @@ def test_samples_that_are_carried_to_another_part_are_air(dense, person):
     assert not miswarped(placed, rays, surface, canonical, 1.0).any()
 
 
-def test_strays_are_air_in_training_and_in_pictures(person):
+def test_strays_are_air_in_training_and_in_images(person):
     recipe = CASES["quick"]
     frame = person.train[1]
     rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))

@@ -94,7 +94,7 @@ def test_poses_bodies_and_cameras_put_the_joints_inside_the_masks(folder):
             assert (frame.mask()[row, column] > 0.4).float().mean() > 0.9
 
 
-def test_the_body_fills_most_of_every_picture_and_never_leaves_it(folder):
+def test_the_body_fills_most_of_every_image_and_never_leaves_it(folder):
     capture = read_capture(folder)
     for frame in (frame for split in capture.splits.values() for frame in split):
         mask = frame.mask() > 0.5
@@ -103,7 +103,7 @@ def test_the_body_fills_most_of_every_picture_and_never_leaves_it(folder):
         assert mask.sum() == mask[1:-1, 1:-1].sum()
 
 
-def test_pictures_are_black_behind_the_person_and_not_clipped_on_it(folder):
+def test_images_are_black_behind_the_person_and_not_clipped_on_it(folder):
     for frame in read_capture(folder).train:
         image, mask = frame.image(), frame.mask()
         assert (image[mask == 0] == 0).all()
@@ -129,7 +129,7 @@ def test_the_given_body_lies_within_the_true_surface(performer):
         assert 0.004 < float((bare - dressed)[seen & dressed.isfinite()].median()) < 0.03
 
 
-def test_the_soles_touch_the_floor_at_every_moment(performer):
+def test_the_soles_touch_the_floor_at_every_frame(performer):
     for time in range(6):
         assert abs(float(studio.perform(performer, time).vertices[:, 1].min())) < 0.02
 

@@ -23,7 +23,7 @@ def test_cameras_stand_in_a_ring_and_the_first_one_ahead(cameras):
     assert torch.allclose(gaps, gaps[0].expand(6), atol=1e-4)
 
 
-def test_cameras_see_all_of_the_body_upright_and_fill_the_picture(cameras):
+def test_cameras_see_all_of_the_body_upright_and_fill_the_image(cameras):
     ringed, body = cameras
     reach = []
     for camera in ringed.values():
@@ -88,6 +88,6 @@ def test_more_noise_is_worse():
     assert 0.8 < overlap(1.0) < overlap(0.3) < 1
 
 
-def test_small_pictures_are_spoiled_as_much_as_large_ones():
+def test_small_images_are_spoiled_as_much_as_large_ones():
     lost = [1 - overlap(1.0, size, size // 10) for size in (64, 128, 256)]
     assert max(lost) < 1.5 * min(lost)

@@ -1,4 +1,4 @@
-"""Epochs of a training: how long they are, which pictures they show, when rates fall."""
+"""Epochs of a training: how long they are, which images they show, when rates fall."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ def shuffled(seed, epoch, frames):
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 5, 379])
-def test_released_epochs_are_whole_steps_that_fill_up_with_the_first_pictures_again(frames):
+def test_released_epochs_are_whole_steps_that_fill_up_with_the_first_images_again(frames):
     recipe = released()
     length = (frames + 1) // 2
     assert epoch_steps(recipe.training, frames) == length
@@ -27,7 +27,7 @@ def test_released_epochs_are_whole_steps_that_fill_up_with_the_first_pictures_ag
         assert shown[2 * length * epoch : 2 * length * (epoch + 1)] == expected
 
 
-def test_epochs_by_pictures_show_each_exactly_once_across_steps():
+def test_epochs_by_images_show_each_exactly_once_across_steps():
     recipe = replace(quick(), training=replace(quick().training, images_per_step=2))
     shown = [frame for step in range(15) for frame in frame_order(recipe.training, recipe.seed, 5, step)]
     assert shown == [frame for epoch in range(6) for frame in shuffled(0, epoch, 5)]
@@ -42,6 +42,6 @@ def test_released_rates_halve_at_200_and_400_epochs_of_whole_steps(frames, lengt
     assert factors == expected
 
 
-def test_rates_by_pictures_halve_wherever_in_a_step_the_epoch_ends():
+def test_rates_by_images_halve_wherever_in_a_step_the_epoch_ends():
     config = TrainingConfig(milestones=(1,))
     assert [rate_factor(config, step, 5) for step in range(4)] == [1, 1, 1, 0.5]

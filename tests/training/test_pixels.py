@@ -62,7 +62,7 @@ def test_ignored_pixels_are_never_drawn(hidden, surroundings):
     assert seen[HIDDEN].any()
 
 
-def test_a_picture_that_ignores_all_of_the_person_is_one_sentence(hidden, tmp_path):
+def test_an_image_that_ignores_all_of_the_person_is_one_sentence(hidden, tmp_path):
     layer = np.full((HEIGHT, WIDTH), 255, np.uint8)
     capture = read_capture(write_tiny(tmp_path / "tiny", ignored={("front", 0): layer}))
     source = PixelSource(capture.train, capture.body, capture.betas, PixelConfig())
@@ -81,7 +81,7 @@ def test_nothing_ignored_draws_as_if_there_were_no_layer(hidden):
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory):
-    """A capture whose first picture has another colour in every pixel, and a soft disk as its mask."""
+    """A capture whose first image has another colour in every pixel, and a soft disk as its mask."""
     folder = tmp_path_factory.mktemp("noisy")
     capture = read_capture(write_tiny(folder / "tiny"))
     image = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
@@ -120,7 +120,7 @@ def brute_reachable(capture, margin):
     return found
 
 
-def test_rays_see_the_picture_on_the_background_at_their_own_pixels(noisy):
+def test_rays_see_the_image_on_the_background_at_their_own_pixels(noisy):
     batch = source_of(noisy).draw(0, seeded()).against(BACKGROUND)
     rows, columns = pixels_seen_by(noisy.train[0].camera, batch)
     image, mask = noisy.train[0].image(), noisy.train[0].mask()
@@ -132,7 +132,7 @@ def test_rays_see_the_picture_on_the_background_at_their_own_pixels(noisy):
     assert 0.2 < batch.mask.mean() < 0.9
 
 
-def test_every_pixel_of_a_patch_is_where_the_picture_has_it(noisy):
+def test_every_pixel_of_a_patch_is_where_the_image_has_it(noisy):
     reachable = brute_reachable(noisy, 0.2)
     batch = source_of(noisy, patches=6, patch_size=13).draw(0, seeded())
     rows, columns = pixels_seen_by(noisy.train[0].camera, batch)
@@ -192,7 +192,7 @@ def test_patches_are_centred_on_the_subject_as_often_as_asked(noisy, share):
     inside = (noisy.train[0].mask() > 0.5)[pixels_seen_by(noisy.train[0].camera, batch)]
     centers = [bool(inside[patch[2, 2]]) for patch in batch.patch_pixels if patch[2, 2] >= 0]
     assert len(centers) > 30
-    # A patch at the border of the picture moves inwards, so its middle is not what was drawn.
+    # A patch at the border of the image moves inwards, so its middle is not what was drawn.
     assert sum(centers) == len(centers) if share else sum(centers) <= 3
 
 
@@ -207,7 +207,7 @@ def test_the_generator_decides_everything(noisy):
     assert torch.equal(first.color, fresh.color), "what was drawn before does not matter"
 
 
-def test_patches_larger_than_the_picture_are_filled_as_far_as_it_goes(noisy):
+def test_patches_larger_than_the_image_are_filled_as_far_as_it_goes(noisy):
     batch = source_of(noisy, patches=1, patch_size=60, margin=9.0).draw(0, seeded())
     expected = torch.full((60, 60), -1)
     expected[:HEIGHT, :WIDTH] = torch.arange(HEIGHT * WIDTH).view(HEIGHT, WIDTH) + batch.singles
@@ -234,7 +234,7 @@ def test_moving_body_and_camera_together_changes_no_pixel(noisy, seed):
     torch.testing.assert_close(there.rays.directions, here.rays.directions @ motion[:3, :3].T, atol=1e-5, rtol=0)
 
 
-def test_pictures_are_read_once(noisy, monkeypatch):
+def test_images_are_read_once(noisy, monkeypatch):
     source = source_of(noisy)
     first = source.draw(0, seeded())
     monkeypatch.setattr(type(noisy.train[0]), "image", lambda frame: pytest.fail("read again"))
@@ -278,7 +278,7 @@ def literal_box_hits(frame, joints, margin):
 
 @pytest.fixture(scope="module")
 def far(noisy):
-    """The noisy picture from further away, so that the box of the joints does not fill it."""
+    """The noisy image from further away, so that the box of the joints does not fill it."""
     frame = noisy.train[0]
     moved = frame.camera.world_to_camera.clone()
     moved[2, 3] += 1.5
@@ -321,7 +321,7 @@ def test_a_pool_smaller_than_the_draw_is_drawn_with_replacement(far):
 
 
 @pytest.mark.parametrize("options", [{}, RELEASED])
-def test_patches_show_the_picture_where_no_ray_goes_and_fill_what_is_rendered_there(far, options):
+def test_patches_show_the_image_where_no_ray_goes_and_fill_what_is_rendered_there(far, options):
     frame, background = far.train[0], torch.tensor([0.1, 0.5, 0.9])
     config = PixelConfig(patches=30, patch_size=20, **options)
     source = PixelSource(far.train, far.body, far.betas, config, margin=0.1)
@@ -344,7 +344,7 @@ def test_patches_show_the_picture_where_no_ray_goes_and_fill_what_is_rendered_th
     assert (plain[off] == 0).all()
 
 
-def test_ignored_pixels_of_a_patch_are_background_in_the_picture_too(hidden):
+def test_ignored_pixels_of_a_patch_are_background_in_the_image_too(hidden):
     config = PixelConfig(patches=20, patch_size=12, patch_on_subject=1.0)
     source = PixelSource(hidden.train, hidden.body, hidden.betas, config, margin=9.0)
     batch = source.draw(1, seeded()).against(BACKGROUND)

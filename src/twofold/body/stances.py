@@ -83,12 +83,12 @@ UNREHEARSED = (
 def choreograph(
     seed: int, rehearsed: int, unrehearsed: int
 ) -> tuple[Float[np.ndarray, "T 24 3"], Float[np.ndarray, "T 2"]]:
-    """Poses of all moments, and how far the body sways sideways and ahead.
+    """Poses of all frames, and how far the body sways sideways and ahead.
 
     Args:
         seed: another seed, another order and other angles.
-        rehearsed: moments of the training motion; the body turns twice about itself.
-        unrehearsed: moments of the unseen motion, which follows.
+        rehearsed: frames of the training motion; the body turns twice about itself.
+        unrehearsed: frames of the unseen motion, which follows.
 
     Returns:
         Axis-angle poses (radians, SMPL's T-pose is zero) and offsets (metres).

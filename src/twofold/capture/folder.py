@@ -45,7 +45,7 @@ def read_capture(folder: Path | str) -> Capture:
     """A capture from its folder. Opens no pixels; `validate` does that.
 
     Raises:
-        TwofoldError: the folder is no capture, or has faults that show without reading the pictures; they are listed.
+        TwofoldError: the folder is no capture, or has faults that show without reading the images; they are listed.
     """
     folder = Path(folder)
     contents, faults = read_contents(folder)
@@ -54,7 +54,7 @@ def read_capture(folder: Path | str) -> Capture:
 
 
 def capture_of(contents: Contents) -> Capture:
-    """The capture that the small files of a folder describe; all pictures that its splits name must be there."""
+    """The capture that the small files of a folder describe; all images that its splits name must be there."""
     folder = contents.folder
     body, betas, poses, translations = contents.body, contents.betas, contents.poses, contents.translations
     if body is None or betas is None or poses is None or translations is None:
@@ -98,9 +98,9 @@ def read_true_motion(folder: Path | str) -> tuple[Float[Tensor, "T 24 3"], Float
 
 
 class CaptureWriter:
-    """Writes a capture folder, picture by picture; it appears under its name only when complete and free of faults.
+    """Writes a capture folder, image by image; it appears under its name only when complete and free of faults.
 
-    The methods for pictures and meshes may be called from several threads at once. The same input gives the same bytes.
+    The methods for images and meshes may be called from several threads at once. The same input gives the same bytes.
 
         with CaptureWriter("out") as writer:
             writer.image("cam", 0, image)
@@ -138,7 +138,7 @@ class CaptureWriter:
         self._stack.__exit__(kind, error, trace)
 
     def image(self, camera: str, time: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """One 8-bit sRGB picture, as PNG."""
+        """One 8-bit sRGB image, as PNG."""
         self._picture(IMAGES, camera, time, image)
 
     def mask(self, camera: str, time: int, mask: UInt8[np.ndarray, "h w"]) -> None:
@@ -146,11 +146,11 @@ class CaptureWriter:
         self._picture(MASKS, camera, time, mask)
 
     def ignored(self, camera: str, time: int, ignored: UInt8[np.ndarray, "h w"]) -> None:
-        """Where nobody knows what the person looks like there (255, else 0), as PNG; pictures may do without."""
+        """Where nobody knows what the person looks like there (255, else 0), as PNG; images may do without."""
         self._picture(IGNORED, camera, time, ignored)
 
     def image_file(self, camera: str, time: int, source: Path) -> None:
-        """A picture file (PNG or JPEG) taken over as it is, so that nothing is lost in coding it anew."""
+        """An image file (PNG or JPEG) taken over as it is, so that nothing is lost in coding it anew."""
         self._copy(IMAGES, camera, time, source)
 
     def mask_file(self, camera: str, time: int, source: Path) -> None:
@@ -162,7 +162,7 @@ class CaptureWriter:
         self._copy(IGNORED, camera, time, source)
 
     def mesh(self, time: int, vertices: Float[np.ndarray, "V 3"], faces: np.ndarray) -> None:
-        """The true surface of a moment: vertices in the world, metres, and triangles."""
+        """The true surface of a frame: vertices in the world, metres, and triangles."""
         buffer = io.BytesIO()
         np.savez(buffer, vertices=vertices.astype(np.float32), faces=faces.astype(np.int32))
         self._put(f"{MESHES}/{file_stem(time)}.npz", buffer.getvalue())
@@ -191,17 +191,17 @@ class CaptureWriter:
             name: for titles.
             body: the body model.
             betas: its shape coefficients.
-            poses: one moment a row, axis-angle, radians, relative to SMPL's T-pose.
+            poses: one frame a row, axis-angle, radians, relative to SMPL's T-pose.
             translations: SMPL's own, metres.
             cameras: by name.
             splits: for each split the times that each camera shows, `{"train": {"cam": [0, 1]}}`.
-            fps: moments per second.
+            fps: frames per second.
             background: colour behind the person, 0..1.
             credit: whom to name when showing it.
             true_poses: where `poses` were disturbed, what they were.
             true_translations: likewise.
             notes: anything worth keeping about how it was made (numbers, texts, lists); nothing reads it.
-            thorough: also judges the pixels of every picture, for pictures that nobody has looked at yet.
+            thorough: also judges the pixels of every image, for images that nobody has looked at yet.
 
         Raises:
             TwofoldError: what was written is no valid capture; all is removed again.

@@ -32,10 +32,10 @@ PICTURE_ENDINGS = (".png", ".jpg", ".jpeg")
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 """Camera names are folder names, so nothing that leaves the folder or breaks on another system."""
 MAX_SIDE = 32_768
-"""Rows or columns of a picture."""
+"""Rows or columns of an image."""
 _MAX_FPS = 100_000
 _MAX_FOCAL = 1000
-"""Focal lengths in widths of the picture; telescopes have fewer."""
+"""Focal lengths in widths of the image; telescopes have fewer."""
 _MAX_RUNS = 12
 """Of numbers, in a sentence."""
 
@@ -47,14 +47,14 @@ class Contents:
     Attributes:
         folder: where they lie.
         name: for titles.
-        fps: moments per second.
+        fps: frames per second.
         background: 0..1.
         credit: whom to name when showing it.
         cameras: by name.
-        splits: pictures (camera, time) of each split, in the order given.
+        splits: images (camera, time) of each split, in the order given.
         body: the body model.
         betas: its shape coefficients.
-        poses: axis-angle, radians, one moment a row.
+        poses: axis-angle, radians, one frame a row.
         translations: metres.
     """
 
@@ -72,7 +72,7 @@ class Contents:
 
     @property
     def pictures(self) -> dict[str, list[int]]:
-        """Moments that any split shows, by camera, in order."""
+        """Frames that any split shows, by camera, in order."""
         wanted: dict[str, set[int]] = {}
         for pictures in self.splits.values():
             for camera, time in pictures:
@@ -80,7 +80,7 @@ class Contents:
         return {camera: sorted(times) for camera, times in wanted.items()}
 
     def files(self, kind: str, camera: str) -> dict[int, Path]:
-        """The pictures there are of one camera, by time; `kind` is "images", "masks" or "ignored"."""
+        """The images there are of one camera, by time; `kind` is "images", "masks" or "ignored"."""
         return numbered_files(self.folder / kind / camera, PICTURE_ENDINGS)
 
 
@@ -102,7 +102,7 @@ def numbered_files(folder: Path, endings: tuple[str, ...]) -> dict[int, Path]:
 
 
 def file_stem(time: int) -> str:
-    """The name of a moment's files.
+    """The name of a frame's files.
 
     >>> file_stem(7)
     '000007'
@@ -168,11 +168,11 @@ def _titles(description: dict[str, Any], faults: list[str]) -> tuple[str, float,
     if not isinstance(name, str) or not name:
         faults.append(f'{DESCRIPTION}: "name" should be a text, it is {shown(name)}.')
     if not isinstance(credit, str):
-        faults.append(f'{DESCRIPTION}: "credit" should be a text (empty for your own pictures), it is {shown(credit)}.')
+        faults.append(f'{DESCRIPTION}: "credit" should be a text (empty for your own images), it is {shown(credit)}.')
     fps = _numbers(description.get("fps"), ())
     if fps is None or not 1e-6 <= fps <= _MAX_FPS:
         given = shown(description.get("fps"))
-        faults.append(f'{DESCRIPTION}: "fps" should be moments per second above 0, up to {_MAX_FPS}; it is {given}.')
+        faults.append(f'{DESCRIPTION}: "fps" should be frames per second above 0, up to {_MAX_FPS}; it is {given}.')
     background = _numbers(description.get("background"), (3,))
     if background is None or background.min() < 0 or background.max() > 1:
         given = shown(description.get("background"))
@@ -238,7 +238,7 @@ def intrinsics_faults(matrix: np.ndarray | None, width: int) -> list[str]:
     elif max(focal) > farthest:
         faults.append(f"the focal length {max(focal):g} is longer than any lens has; give it in pixels.")
     if np.abs(matrix[:2, 2]).max() > farthest:
-        faults.append("the principal point is far outside the picture; give it in pixels.")
+        faults.append("the principal point is far outside the image; give it in pixels.")
     if np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6 or abs(matrix[1, 0]) > 1e-6:
         faults.append("intrinsics should read [fx s cx; 0 fy cy; 0 0 1]; perhaps the matrix is transposed.")
     return faults
@@ -248,7 +248,7 @@ def _splits(
     given: Any, cameras: set[str], moments: int | None, faults: list[str]
 ) -> dict[str, tuple[tuple[str, int], ...]]:
     if not isinstance(given, dict):
-        faults.append(f'{DESCRIPTION}: "splits" should name the pictures of {", ".join(SPLITS)}.')
+        faults.append(f'{DESCRIPTION}: "splits" should name the images of {", ".join(SPLITS)}.')
         return dict.fromkeys(SPLITS, ())
     for name in set(given) - set(SPLITS):
         faults.append(f"{DESCRIPTION}: there is no split {shown(name)}; the splits are {', '.join(SPLITS)}.")
@@ -262,18 +262,18 @@ def _splits(
         faults.append(f"{DESCRIPTION}: the train split is empty; there is nothing to learn from.")
     elif len(train_times) == 1:
         faults.append(
-            f"{DESCRIPTION}: the train split shows one moment only (time {min(train_times)}); "
+            f"{DESCRIPTION}: the train split shows one frame only (time {min(train_times)}); "
             "at least two poses are needed to learn how a person moves."
         )
     seen = {time for camera, time in splits["novel_view"] if (camera, time) in train}
     unseen = {time for _, time in splits["novel_view"]} - train_times
     again = {time for _, time in splits["novel_pose"]} & train_times
     if seen:
-        faults.append(f"{DESCRIPTION}: novel_view holds training pictures at {spans(seen)}; leave them out of one.")
+        faults.append(f"{DESCRIPTION}: novel_view holds training images at {spans(seen)}; leave them out of one.")
     if unseen and train:
-        faults.append(f"{DESCRIPTION}: novel_view shows moments not trained on, {spans(unseen)}; use novel_pose.")
+        faults.append(f"{DESCRIPTION}: novel_view shows frames not trained on, {spans(unseen)}; use novel_pose.")
     if again:
-        faults.append(f"{DESCRIPTION}: novel_pose shows training moments, {spans(again)}; they are not novel.")
+        faults.append(f"{DESCRIPTION}: novel_pose shows training frames, {spans(again)}; they are not novel.")
     return splits
 
 
@@ -304,7 +304,7 @@ def _split(
         pictures += [(camera, time) for time in times if time not in beyond]
     twice = [time for (_, time), count in Counter(pictures).items() if count > 1]
     if twice:
-        faults.append(f"{where} names the same picture twice at times {spans(twice)}; once is enough.")
+        faults.append(f"{where} names the same image twice at times {spans(twice)}; once is enough.")
     return tuple(dict.fromkeys(pictures))
 
 

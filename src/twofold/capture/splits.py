@@ -12,7 +12,7 @@ from twofold.inputs import read_json
 
 
 def leave_out(folder: Path | str, images: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:
-    """Takes images out of all splits, and with a training moment its novel views; the notes list them.
+    """Takes images out of all splits, and with a training frame its novel views; the notes list them.
 
     Args:
         folder: the capture.

@@ -17,17 +17,17 @@ from twofold.images import read_grey, read_rgb
 Item = TypeVar("Item")
 
 SPLITS = ("train", "novel_view", "novel_pose")
-"""Training pictures; the same moments from other cameras; other moments."""
+"""Training images; the same frames from other cameras; other frames."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture: a camera at a moment. Pictures are read when asked for, so a long capture costs no memory.
+    """One image: what a camera saw in a frame. Images are read when asked for, so a long capture costs no memory.
 
     One that is damaged or gone is a `TwofoldError` then.
 
     Attributes:
-        time: index of the moment into the capture's motion.
+        time: index of the frame in the capture's motion.
         camera_name: which camera.
         camera: that camera.
         pose: axis-angle rotations, root first, radians, relative to SMPL's T-pose.
@@ -68,15 +68,15 @@ class Frame:
 
 @dataclass(frozen=True)
 class Capture:
-    """A person filmed: body, cameras, motion, pictures, splits.
+    """A person filmed: body, cameras, motion, images, splits.
 
     Attributes:
         name: for titles.
         folder: where it lies.
         body: the body model as arrays.
         betas: its shape coefficients for this person.
-        fps: moments per second.
-        background: the colour behind the person where a picture is composited, 0..1.
+        fps: frames per second.
+        background: the colour behind the person where an image is composited, 0..1.
         splits: frames of "train", "novel_view" and "novel_pose" (the last two may be empty).
         meshes: true posed surfaces by time (npz with vertices in metres and faces), where they are known.
         credit: whom to name when showing it; empty for one's own.

@@ -1,6 +1,6 @@
 """Every fault of a capture folder, found in one go and said in one sentence each.
 
-The quick checks open no pixels; the thorough ones read every picture.
+The quick checks open no pixels; the thorough ones read every image.
 """
 
 from collections.abc import Callable, Iterable
@@ -36,7 +36,7 @@ from twofold.npz import are_moderate, read_npz
 Item = TypeVar("Item")
 _IMAGE_MODES, _MASK_MODES = ("RGB", "RGBA", "L"), ("L", "1")
 _MEANINGS = {
-    IMAGES: "an 8-bit colour picture",
+    IMAGES: "an 8-bit colour image",
     MASKS: "one 8-bit channel, 0 outside and 255 on the person",
     IGNORED: "one 8-bit channel, 255 where nothing is known of the person",
 }
@@ -47,7 +47,7 @@ _PERSON = 128
 
 
 def validate(folder: Path | str) -> list[str]:
-    """Everything that is wrong with a capture folder; an empty list if nothing is. Reads every picture.
+    """Everything that is wrong with a capture folder; an empty list if nothing is. Reads every image.
 
     Each fault is one sentence that says where (files as seen from `folder`), what, and what to do.
     """
@@ -77,7 +77,7 @@ def require(faults: list[str], folder: Path | str, shown: int = 8) -> None:
 
 
 def quick_faults(contents: Contents) -> list[str]:
-    """What files' names, picture headers and projected joints show: missing, wrong-sized, behind, outside."""
+    """What files' names, image headers and projected joints show: missing, wrong-sized, behind, outside."""
     faults: list[str] = []
     for camera_name, times in contents.pictures.items():
         for kind, modes in ((IMAGES, _IMAGE_MODES), (MASKS, _MASK_MODES), (IGNORED, _MASK_MODES)):
@@ -85,7 +85,7 @@ def quick_faults(contents: Contents) -> list[str]:
             missing = [time for time in times if time not in there]
             if missing and kind != IGNORED:
                 faults.append(
-                    f"{kind}/{camera_name} lacks the pictures of times {spans(missing)}; "
+                    f"{kind}/{camera_name} lacks the images of times {spans(missing)}; "
                     f"add them ({file_stem(missing[0])}.png and so on) or take these times out of the splits."
                 )
             if camera_name in contents.cameras:
@@ -114,7 +114,7 @@ def _header_faults(folder: Path, paths: list[Path], camera: Camera, modes: tuple
 
 
 def joint_positions(contents: Contents) -> Float[Tensor, "T 24 3"] | None:
-    """Where the joints stand at every moment, world, metres; None where body or motion could not be read."""
+    """Where the joints stand in every frame, world, metres; None where body or motion could not be read."""
     body, betas, poses, translations = contents.body, contents.betas, contents.poses, contents.translations
     if body is None or betas is None or poses is None or translations is None:
         return None
@@ -124,7 +124,7 @@ def joint_positions(contents: Contents) -> Float[Tensor, "T 24 3"] | None:
 
 
 def _placement_faults(contents: Contents) -> list[str]:
-    """Cameras that have the body behind them or beside their picture."""
+    """Cameras that have the body behind them or beside their image."""
     joints = joint_positions(contents)
     if joints is None:
         return []
@@ -144,14 +144,14 @@ def _placement_faults(contents: Contents) -> list[str]:
             )
         if outside.any():
             faults.append(
-                f"The body is outside the picture of camera {name} at times {spans(_where(shown, outside))}; "
+                f"The body is outside the image of camera {name} at times {spans(_where(shown, outside))}; "
                 f"check its intrinsics (pixels) and the translations in {MOTION} (metres)."
             )
     return faults
 
 
 def pixel_faults(contents: Contents) -> list[str]:
-    """What only the pixels show: damaged pictures, empty or full masks, masks that the body is nowhere near."""
+    """What only the pixels show: damaged images, empty or full masks, masks that the body is nowhere near."""
     joints = joint_positions(contents)
     faults: list[str] = []
     for name, times in contents.pictures.items():
@@ -171,7 +171,7 @@ def pixel_faults(contents: Contents) -> list[str]:
 
 
 class ShownJoints(NamedTuple):
-    """Pixels (column, row) of the joints inside a picture, and how far all of them reach, pixels."""
+    """Pixels (column, row) of the joints inside an image, and how far all of them reach, pixels."""
 
     inside: np.ndarray
     reach: float
@@ -186,9 +186,9 @@ def _shown_joints(joints: Float[Tensor, "T 24 3"], camera: Camera) -> dict[int, 
 
 
 def _decoded(folder: Path, path: Path, mode: Literal["L", "RGB"]) -> tuple[np.ndarray | None, str]:
-    """A picture's pixels, or None and what is wrong with them; that is empty where a quick check has named it.
+    """An image's pixels, or None and what is wrong with them; that is empty where a quick check has named it.
 
-    Checksums alone would cost a tenth, but there are pictures whose checksums are right and whose pixels are not there,
+    Checksums alone would cost a tenth, but there are images whose checksums are right and whose pixels are not there,
     as there are some whose pixels can be decoded although a few are wrong.
     """
     try:
@@ -212,7 +212,7 @@ def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, ShownJoin
     Args:
         folder: the capture's.
         size: height and width that it should have.
-        item: its file, and the joints in the picture, None where they are not known.
+        item: its file, and the joints in the image, None where they are not known.
     """
     path, joints = item
     mask, damaged = _decoded(folder, path, "L")
@@ -224,14 +224,12 @@ def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, ShownJoin
     if mask.max() < _PERSON:
         return f"{where} reaches only {mask.max()}; the person should be 255."
     if mask.min() >= _PERSON:
-        return (
-            f"{where} is all white, as if the person filled the picture; mend it or take this time out of the splits."
-        )
+        return f"{where} is all white, as if the person filled the image; mend it or take this time out of the splits."
     columns, rows = np.flatnonzero((mask >= _PERSON).any(0)), np.flatnonzero((mask >= _PERSON).any(1))
     if joints is not None and len(joints.inside) and mask.shape == size:
         low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]])
         if not ((joints.inside >= low) & (joints.inside <= high)).all(-1).any():
-            return f"{where} and the posed body do not meet; check that mask, pose and camera are of the same moment."
+            return f"{where} and the posed body do not meet; check that mask, pose and camera are of the same frame."
         tall = float((high - low).max())
         if joints.reach < _FAR_TOO_SMALL * tall:
             return (
@@ -293,6 +291,6 @@ def _where(times: list[int], chosen: Tensor) -> list[int]:
 
 
 def _in_threads(check: Callable[[Item], str], items: Iterable[Item]) -> list[str]:
-    """The faults that `check` finds, in the order of the items. Decoding pictures leaves Python's lock free."""
+    """The faults that `check` finds, in the order of the items. Decoding images leaves Python's lock free."""
     with ThreadPoolExecutor() as pool:
         return [fault for fault in pool.map(check, items) if fault]

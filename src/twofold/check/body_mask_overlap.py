@@ -16,7 +16,7 @@ LARGER, SMALLER = 1.2, 0.92
 OFF = 0.05
 """Masks off the body's middle by more than this, in body heights, everywhere alike: a hand's breadth."""
 MOST_NAMED = 4
-"""So many exchanged pictures are named one by one."""
+"""So many exchanged images are named one by one."""
 
 
 def agreement(facts: Facts) -> Iterator[Finding]:
@@ -42,8 +42,8 @@ def agreement(facts: Facts) -> Iterator[Finding]:
             Finding(
                 graded(iou < LEAST_IOU),
                 "moments",
-                f"Pictures fit the poses of {counted(abs(moment), 'moment')} {late} better, by {gain:.2f} in IoU",
-                f"Move the rows of motion.npz by {-moment:+d}, or rename the pictures.",
+                f"Images fit the poses of {counted(abs(moment), 'frame')} {late} better, by {gain:.2f} in IoU",
+                f"Move the rows of motion.npz by {-moment:+d}, or rename the images.",
             )
         )
     yield from explained
@@ -83,7 +83,7 @@ def _disagreement(iou: float, where: str) -> Finding:
         "disagreement",
         f"Body and masks do not agree (mean IoU {iou:.2f}), and no usual convention of axes, sides, units or "
         "intrinsics would mend it",
-        "Look at the overlays below: fit the poses again, or see whether pictures, masks and poses belong together.",
+        "Look at the overlays below: fit the poses again, or see whether images, masks and poses belong together.",
         where,
     )
 
@@ -94,9 +94,9 @@ def _bad_frames(facts: Facts, frames: list[FrameFacts]) -> Iterator[Finding]:
         more = f", and {len(facts.elsewhere) - MOST_NAMED} more" if len(facts.elsewhere) > MOST_NAMED else ""
         yield Finding(
             graded(len(facts.elsewhere) > MOST_BAD * len(frames)),
-            "exchanged pictures",
-            f"{counted(len(facts.elsewhere), 'picture')} with the pose of another moment: {named}{more}",
-            "Put pictures and poses into the same order, or leave them out: check --write-splits.",
+            "exchanged images",
+            f"{counted(len(facts.elsewhere), 'image')} with the pose of another frame: {named}{more}",
+            "Put images and poses into the same order, or leave them out: check --write-splits.",
             places_of((camera, time) for camera, time, _ in facts.elsewhere),
             tuple((camera, time) for camera, time, _ in facts.elsewhere),
         )
@@ -106,7 +106,7 @@ def _bad_frames(facts: Facts, frames: list[FrameFacts]) -> Iterator[Finding]:
         yield Finding(
             graded(len(rest) > MOST_BAD * len(frames)),
             "bad frames",
-            f"In {counted(len(rest), 'picture')} body and mask do not agree: IoU below {LEAST_IOU:g}, down to "
+            f"In {counted(len(rest), 'image')} body and mask do not agree: IoU below {LEAST_IOU:g}, down to "
             f"{min(f.iou for f in rest):.2f}",
             "Fit these again, fix their masks, or leave them out: check --write-splits, or prepare --drop FRAMES.",
             places(rest),
@@ -121,7 +121,7 @@ def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
         yield Finding(
             graded(len(swapped) > MOST_BAD * len(telling)),
             "sides",
-            f"In {counted(len(swapped), 'picture')} the body fits better with left and right limbs exchanged",
+            f"In {counted(len(swapped), 'image')} the body fits better with left and right limbs exchanged",
             "Exchange left and right in these poses, or leave them out: check --write-splits.",
             places(swapped),
             tuple((f.camera, f.time) for f in swapped),
@@ -130,7 +130,7 @@ def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
         yield Finding(
             "note",
             "sides",
-            f"Whether left and right are exchanged shows in {len(telling)} of {len(frames)} pictures only; in the "
+            f"Whether left and right are exchanged shows in {len(telling)} of {len(frames)} images only; in the "
             "others both ways cover the same pixels",
             "Look at the overlays: left limbs are orange, right ones blue.",
         )
@@ -145,7 +145,7 @@ def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
         yield Finding(
             graded(len(turned) > MOST_BAD * len(frames)),
             "facing",
-            f"In {counted(len(turned), 'picture')} the body fits better facing the other way",
+            f"In {counted(len(turned), 'image')} the body fits better facing the other way",
             "Turn these roots by half about the body's axis and exchange left and right, or leave them out: check "
             "--write-splits.",
             places(turned),
@@ -154,12 +154,12 @@ def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
 
 
 def _faces(facts: Facts) -> Iterator[Finding]:
-    # Patterns pass for a face in a few pictures of a hundred.
+    # Patterns pass for a face in a few images of a hundred.
     if len(facts.faces) >= max(3, 0.25 * len(facts.backs)):
         yield Finding(
             graded(len(facts.faces) > 0.5 * len(facts.backs)),
             "faces",
-            f"A face looks at the camera in {len(facts.faces)} of {len(facts.backs)} pictures where the body shows its "
+            f"A face looks at the camera in {len(facts.faces)} of {len(facts.backs)} images where the body shows its "
             "back",
             "Turn these roots by half about the body's axis and exchange left and right limbs.",
             places_of(facts.faces),
@@ -184,5 +184,5 @@ def _placement(frames: list[FrameFacts]) -> Iterator[Finding]:
             "warning",
             "offset",
             f"Masks lie {' and '.join(words)} the body, in body heights, everywhere alike",
-            "Check the principal point, whether pictures were cropped, and what the translations are relative to.",
+            "Check the principal point, whether images were cropped, and what the translations are relative to.",
         )

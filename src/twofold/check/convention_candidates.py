@@ -23,9 +23,9 @@ class Placed:
         pose: axis-angle, radians.
         translation: SMPL's own, metres.
         world_to_camera: of the camera.
-        intrinsics: of the camera, for the whole picture.
-        height: of the picture, pixels.
-        width: of the picture, pixels.
+        intrinsics: of the camera, for the whole image.
+        height: of the image, pixels.
+        width: of the image, pixels.
     """
 
     points: Float[Tensor, "n 3"]
@@ -67,11 +67,11 @@ def sizes(ratio: float) -> list[Convention]:
     for r in (0.5, 2.0, *([ratio] if 0.1 < ratio < 10 and abs(math.log(ratio)) > 0.12 else [])):
         found += [
             Convention(
-                f"focal length x {r:.3g}", f"the focal length is {1 / r:.3g} times what the pictures show",
+                f"focal length x {r:.3g}", f"the focal length is {1 / r:.3g} times what the images show",
                 f"multiply fx and fy by {r:.3g}", "size", lambda p, r=r: _zoomed(p, r, False),
             ),
             Convention(
-                f"intrinsics x {r:.3g}", f"the intrinsics belong to pictures {1 / r:.3g} times as large",
+                f"intrinsics x {r:.3g}", f"the intrinsics belong to images {1 / r:.3g} times as large",
                 f"multiply fx, fy, cx and cy by {r:.3g}", "size", lambda p, r=r: _zoomed(p, r, True),
             ),
             Convention(
@@ -126,7 +126,7 @@ def _camera(change: Callable[[Tensor], Tensor]) -> Callable[[Placed], Placed]:
 
 
 def _picture(change: Callable[[int, int], Sequence[Sequence[float | int]]]) -> Callable[[Placed], Placed]:
-    """Pictures whose pixels are stored in another order; `change` takes height and width."""
+    """Images whose pixels are stored in another order; `change` takes height and width."""
 
     def changed(p: Placed) -> Placed:
         return replace(p, intrinsics=torch.tensor(change(p.height, p.width), dtype=torch.float32) @ p.intrinsics)
@@ -228,8 +228,8 @@ CONVENTIONS: tuple[Convention, ...] = (
         "exchange the rotations of left and right joints", "pose", _raw_swap,
     ),
     Convention(
-        "pictures mirrored", "pictures and masks are mirrored left to right against body and cameras",
-        "mirror them back or, where writing in the pictures reads well, mirror poses, translations and cameras",
+        "images mirrored", "images and masks are mirrored left to right against body and cameras",
+        "mirror them back or, where writing in the images reads well, mirror poses, translations and cameras",
         "picture",
         _picture(lambda h, w: ((-1, 0, w - 1), (0, 1, 0), (0, 0, 1))),
     ),
@@ -306,31 +306,31 @@ CONVENTIONS: tuple[Convention, ...] = (
         "divide template, joints and the shape bases in body.npz by 100", "unit", lambda p: _shrunk(p, 1e-2),
     ),
     Convention(
-        "upside-down pictures", "pictures and masks stand on their heads", "turn them by half", "picture",
+        "upside-down images", "images and masks stand on their heads", "turn them by half", "picture",
         _picture(lambda h, w: ((-1, 0, w - 1), (0, -1, h - 1), (0, 0, 1))),
     ),
     Convention(
-        "rows from the bottom", "the rows of pictures and masks run from the bottom up", "turn them over", "picture",
+        "rows from the bottom", "the rows of images and masks run from the bottom up", "turn them over", "picture",
         _picture(lambda h, w: ((1, 0, 0), (0, -1, h - 1), (0, 0, 1))),
     ),
     Convention(
-        "pictures turned right", "pictures and masks are turned by a quarter, clockwise, against the camera",
+        "images turned right", "images and masks are turned by a quarter, clockwise, against the camera",
         "turn them back by a quarter", "picture", _picture(lambda h, w: ((0, -1, w - 1), (1, 0, 0), (0, 0, 1))),
     ),
     Convention(
-        "pictures turned left", "pictures and masks are turned by a quarter, anticlockwise, against the camera",
+        "images turned left", "images and masks are turned by a quarter, anticlockwise, against the camera",
         "turn them back by a quarter", "picture", _picture(lambda h, w: ((0, 1, 0), (-1, 0, h - 1), (0, 0, 1))),
     ),
     Convention(
-        "camera rolled right", "the camera is rolled by a quarter against its pictures",
+        "camera rolled right", "the camera is rolled by a quarter against its images",
         "exchange its first two rows and negate the new first", "camera", _camera(_rolled(1)),
     ),
     Convention(
-        "camera rolled left", "the camera is rolled by a quarter against its pictures",
+        "camera rolled left", "the camera is rolled by a quarter against its images",
         "exchange its first two rows and negate the new second", "camera", _camera(_rolled(-1)),
     ),
     Convention(
-        "principal point off the middle", "the principal point is not where the pictures show it",
+        "principal point off the middle", "the principal point is not where the images show it",
         "put it into the middle: cx = (width - 1) / 2, cy = (height - 1) / 2", "center",
         lambda p: _centered(p, (p.width - 1) / 2, (p.height - 1) / 2),
     ),

@@ -1,4 +1,4 @@
-"""Which other convention would make bodies cover their masks: axes, sides, units, translations, pictures, moments.
+"""Which other convention would make bodies cover their masks: axes, sides, units, translations, images, frames.
 
 Every guess moves the same points of the body's surface, so that hundreds of guesses cost less than a second.
 """
@@ -31,11 +31,11 @@ ALMOST_AS_GOOD = 0.02
 IN_MOST = 0.75
 """Share of the frames in which a guess must be better."""
 EXCHANGED, EXCHANGED_GAIN = 0.7, 0.15
-"""A picture shows another moment's pose where that fits so well, and so much better than its own."""
+"""An image shows another frame's pose where that fits so well, and so much better than its own."""
 MOST_PAIRS = 16
 """So many of some seven hundred pairs are tried on all frames."""
 MOMENTS = 5
-"""So many moments early or late are tried."""
+"""So many frames early or late are tried."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Sample:
         placed: as the capture has it.
         mask: in the window around the person.
         known: pixels of the window that are not ignored.
-        to_window: from pixels of the picture to pixels of the window.
-        time: moment.
+        to_window: from pixels of the image to pixels of the window.
+        time: frame.
     """
 
     placed: Placed
@@ -130,11 +130,11 @@ def diagnose(samples: Sequence[Sample], size_ratio: float = 1.0) -> Diagnosis:
 def best_moment(
     samples: Sequence[Sample], poses: Float[Tensor, "T 24 3"], translations: Float[Tensor, "T 3"]
 ) -> tuple[int, float, float]:
-    """By how many moments the motion is late (or early, below 0), judged by which poses fit the masks best.
+    """By how many frames the motion is late (or early, below 0), judged by which poses fit the masks best.
 
     Returns:
-        the number of moments, by how much the mean IoU rises with it, and in what share of the frames it does; 0
-        moments where no other number is better beyond doubt.
+        the number of frames, by how much the mean IoU rises with it, and in what share of the frames it does; 0
+        frames where no other number is better beyond doubt.
     """
     shifts = [k for k in range(-MOMENTS, MOMENTS + 1) if k]
     usable = [s for s in samples if MOMENTS <= s.time < len(poses) - MOMENTS]
@@ -157,7 +157,7 @@ def poses_elsewhere(
     poses: Float[Tensor, "T 24 3"],
     translations: Float[Tensor, "T 3"],
 ) -> list[int | None]:
-    """For each badly fitting frame the moment whose pose it shows instead; None where no pose of `times` fits well."""
+    """For each badly fitting frame the frame whose pose it shows instead; None where no pose of `times` fits well."""
     found: list[int | None] = []
     for sample in samples:
         moved = [replace(sample.placed, translation=translations[t]).posed(poses[t]) for t in times]

@@ -19,7 +19,7 @@ class Finding:
         level: a fault makes a capture not trainable, a warning costs quality, a note is for information.
         topic: short, the same in every version.
         what: a sentence.
-        where: cameras and moments; empty for the whole capture.
+        where: cameras and frames; empty for the whole capture.
         mend: a sentence about what to do.
         images: camera and time of those that `check --write-splits` leaves out because of it.
     """

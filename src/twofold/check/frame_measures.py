@@ -1,4 +1,4 @@
-"""What one picture of a capture says: how well mask and posed body agree, and whether their sides do."""
+"""What one image of a capture says: how well mask and posed body agree, and whether their sides do."""
 
 from dataclasses import dataclass
 
@@ -31,10 +31,10 @@ _OTHER_SIDE = [
 
 @dataclass(frozen=True)
 class Window:
-    """A part of a picture, scaled down.
+    """A part of an image, scaled down.
 
     Attributes:
-        box: left, top, right, bottom in whole pixels of the picture; the last two are outside.
+        box: left, top, right, bottom in whole pixels of the image; the last two are outside.
         camera: sees just this part in its new size.
     """
 
@@ -47,7 +47,7 @@ class Window:
         return np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX, box=self.box)) > 127
 
     def image(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "a b 3"]:
-        """The same part of a picture."""
+        """The same part of an image."""
         size = (self.camera.width, self.camera.height)
         return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS, box=self.box))
 
@@ -73,17 +73,17 @@ class Twins:
 
 @dataclass(frozen=True)
 class FrameFacts:
-    """What one picture showed.
+    """What one image showed.
 
     Attributes:
         camera: its name.
-        time: moment.
+        time: frame.
         split: of the capture.
         iou: silhouette of the posed body and mask, where nothing is ignored.
         size_ratio: root of mask area over body area; above 1 the mask is larger.
         offset: from the body's centre to the mask's, in body heights: right and down.
         body_height: of the person standing upright at that distance, pixels.
-        body_outside: share of the body's points that project outside the picture.
+        body_outside: share of the body's points that project outside the image.
         mask: facts of the mask alone.
         ignored: share of the mask that is ignored, because something hides the person there.
         twins: whether other sides fit better.
@@ -164,15 +164,15 @@ def window_of(
     margin: float = 0.06,
     aspect: float | None = None,
 ) -> Window:
-    """The part of a picture that holds its mask and these pixels (column, row), as far as they are in it.
+    """The part of an image that holds its mask and these pixels (column, row), as far as they are in it.
 
     Args:
-        camera: of the picture.
-        mask: of the picture.
+        camera: of the image.
+        mask: of the image.
         pixels: that should be seen, too.
         longest: side of the window, pixels; it is never enlarged.
         margin: added on each side, as a share of the longer side.
-        aspect: width over height that is wanted, as far as the picture reaches; any without.
+        aspect: width over height that is wanted, as far as the image reaches; any without.
     """
     shown = mask > 127
     columns, rows = np.flatnonzero(shown.any(0)), np.flatnonzero(shown.any(1))
@@ -213,7 +213,7 @@ def splat(pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"], height: int, 
 
 @dataclass(frozen=True)
 class Look:
-    """A picture opened, with the body drawn into it.
+    """An image opened, with the body drawn into it.
 
     Attributes:
         window: the part that is looked at.
@@ -231,7 +231,7 @@ class Look:
 
 
 def read_bytes(frame: Frame) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
-    """Picture and mask as they are stored."""
+    """Image and mask as they are stored."""
     return read_rgb(frame.image_file), read_grey(frame.mask_file)
 
 
@@ -252,7 +252,7 @@ def look_at(
     longest: int = LOOKED_AT,
     aspect: float | None = None,
 ) -> Look:
-    """Draws the posed body into the part of the picture that holds it and the mask; see `window_of`."""
+    """Draws the posed body into the part of the image that holds it and the mask; see `window_of`."""
     vertices = posed_points(shaped, frame.pose, frame.translation)
     pixels, depth = project(frame.camera, vertices)
     window = window_of(frame.camera, mask, pixels[depth > 0], longest, aspect=aspect)
@@ -267,10 +267,10 @@ def look_at(
 
 
 def frame_facts(frame: Frame, split: str, shaped: ShapedBody, points: ShapedBody) -> FrameFacts:
-    """Everything that is measured in one picture.
+    """Everything that is measured in one image.
 
     Args:
-        frame: the picture.
+        frame: the image.
         split: that it belongs to.
         shaped: the person's body.
         points: the same as `surface_points`.
@@ -323,7 +323,7 @@ def _twins(frame: Frame, points: ShapedBody, given: Float[Tensor, "n 3"], mask: 
 
 
 def _sharpness(image: np.ndarray, mask: np.ndarray) -> float:
-    """Mean absolute Laplacian on the person, away from the outline, which is sharp in any cut-out picture."""
+    """Mean absolute Laplacian on the person, away from the outline, which is sharp in any cut-out image."""
     person = mask > 127
     rows, columns = np.flatnonzero(person.any(1)), np.flatnonzero(person.any(0))
     if not len(rows):

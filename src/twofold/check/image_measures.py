@@ -1,4 +1,4 @@
-"""What pictures show beside the mask: a background that moves or changes its brightness, faces where none should be."""
+"""What images show beside the mask: a background that moves or changes its brightness, faces where none should be."""
 
 import functools
 import math
@@ -27,13 +27,13 @@ HEAD, FACE = 0.44, (0.1, 0.3)
 
 @dataclass(frozen=True)
 class Background:
-    """How the surroundings change in the pictures of one camera.
+    """How the surroundings change in the images of one camera.
 
     Attributes:
-        times: moments that were compared with the first.
-        shift: the largest movement, as a share of the picture's longer side; None where it cannot be told.
-        brightness: at each of these moments relative to the first; empty where nothing could be compared.
-        lost: there is a background with details, but it cannot be followed from picture to picture.
+        times: frames that were compared with the first.
+        shift: the largest movement, as a share of the image's longer side; None where it cannot be told.
+        brightness: at each of these frames relative to the first; empty where nothing could be compared.
+        lost: there is a background with details, but it cannot be followed from image to image.
     """
 
     times: tuple[int, ...]
@@ -43,7 +43,7 @@ class Background:
 
 
 def background_of(frames: Sequence[Frame]) -> Background:
-    """Compares the surroundings in pictures of one camera with those in the first of them."""
+    """Compares the surroundings in images of one camera with those in the first of them."""
     times = tuple(frame.time for frame in frames[1:])
     views = [_surroundings(frame) for frame in frames]
     if len(views) < 2 or views[0].plain:
@@ -69,7 +69,7 @@ def shows_its_back(frame: Frame, shaped: ShapedBody) -> bool:
 
 
 def sees_a_face(frame: Frame, shaped: ShapedBody) -> bool:
-    """Whether a face looks out of the picture where the posed body has its head."""
+    """Whether a face looks out of the image where the posed body has its head."""
     transforms = joint_transforms(shaped.joints, frame.pose, frame.translation)
     placed = (transforms[:, :3, :3] @ shaped.joints[:, :, None])[..., 0] + transforms[:, :3, 3]
     neck, head = placed[JOINT_NAMES.index("neck")], placed[JOINT_NAMES.index("head")]
@@ -79,7 +79,7 @@ def sees_a_face(frame: Frame, shaped: ShapedBody) -> bool:
     (x, y), up = pixels[1].tolist(), (pixels[1] - pixels[0]).tolist()
     scale = float(frame.camera.intrinsics[0, 0]) / float(depth[1])
     half = 0.5 * HEAD * scale
-    # The head's surroundings first: turning a whole picture takes ten times as long.
+    # The head's surroundings first: turning a whole image takes ten times as long.
     wide = load_image(frame.image_file).convert("RGB").crop(_box(x, y, 1.5 * half))
     upright = wide.rotate(math.degrees(math.atan2(up[0], -up[1])), Image.Resampling.BILINEAR)
     middle = upright.width / 2

@@ -17,14 +17,14 @@ class MaskFacts:
     """What one mask shows.
 
     Attributes:
-        share: of the picture that the person covers.
+        share: of the image that the person covers.
         softness: width of the soft edge, pixels; 0 for a mask of black and white alone.
         roughness: how far the edge strays from a smooth one, as a share of the person's height.
         grain: steps of the outline, pixels: 1 for a mask made at its own size, 8 for one enlarged eightfold.
-        borders: sides of the picture that the mask runs into: "left", "top", "right", "bottom".
+        borders: sides of the image that the mask runs into: "left", "top", "right", "bottom".
         pieces: connected parts that matter.
         loose: share of the mask that does not hang together with the largest part.
-        border_share: share of the picture's border that the mask covers.
+        border_share: share of the image's border that the mask covers.
     """
 
     share: float

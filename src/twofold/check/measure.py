@@ -27,11 +27,11 @@ from twofold.errors import TwofoldError
 from twofold.geometry.cameras import project
 
 MOST_LOOKED_AT = 100
-"""Pictures that are looked at unless more are asked for: a tenth of a second each."""
+"""Images that are looked at unless more are asked for: a tenth of a second each."""
 MOST_VALIDATED = 1000
-"""Pictures of a longer capture that are opened to find damaged ones; training opens them all."""
+"""Images of a longer capture that are opened to find damaged ones; training opens them all."""
 SAMPLES, MOMENT_SAMPLES, BACKGROUNDS, BACKS, MOST_EXCHANGED = 12, 24, 24, 20, 40
-"""Frames on which conventions and moments are tried, backgrounds of a camera and views from behind that are looked at,
+"""Frames on which conventions and frames are tried, backgrounds of a camera and views from behind that are looked at,
 bad frames whose pose is looked for elsewhere."""
 POOR = 0.65
 """Mean IoU of a camera below which its body is not where its person is. Automatic fits of real people reach 0.82 to
@@ -40,7 +40,7 @@ POOR = 0.65
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """What one camera is, and how well its pictures agree with the body.
+    """What one camera is, and how well its images agree with the body.
 
     Attributes:
         name: of the camera.
@@ -49,7 +49,7 @@ class CameraFacts:
         iou: mean over these.
         view_angle: across the longer side, degrees.
         aspect: fy over fx.
-        off_center: from the middle of the picture to the principal point, as a share of the longer side.
+        off_center: from the middle of the image to the principal point, as a share of the longer side.
         distance: of the body, median, metres.
     """
 
@@ -84,21 +84,21 @@ class Facts:
         name: its title.
         folder: where it lies.
         credit: whom to name.
-        fps: moments per second.
+        fps: frames per second.
         pictures: in all splits, by split.
-        train_times: moments that train.
+        train_times: frames that train.
         stature: of the person, metres.
-        frames: the pictures that were looked at.
+        frames: the images that were looked at.
         cameras: what they are.
         motion: what it shows.
         backgrounds: by camera, of those that train.
         backs: views from behind in which a face was looked for.
         faces: those in which one was found.
         doubts: what would fit better.
-        moment: by how many moments the motion is late, and what the IoU gains with it.
-        elsewhere: camera and time of pictures that show the pose of another moment, and that moment.
-        twins: test pictures whose bytes equal a training picture's: split, camera, time.
-        repeated: training moments whose picture equals the one before.
+        moment: by how many frames the motion is late, and what the IoU gains with it.
+        elsewhere: camera and time of images that show the pose of another frame, and that frame.
+        twins: test images whose bytes equal a training image's: split, camera, time.
+        repeated: training frames whose image equals the one before.
     """
 
     name: str
@@ -128,7 +128,7 @@ def measure_capture(
 
     Args:
         folder: the capture.
-        most: so many pictures are looked at, spread evenly, two thirds of them training pictures.
+        most: so many images are looked at, spread evenly, two thirds of them training images.
         watch: called with the share that is done.
 
     Raises:
@@ -209,14 +209,14 @@ def _usable(folder: Path) -> Contents:
     bodiless = replace(contents, body=None), replace(thinned, body=None)
     why = ""
     if not (faults or quick_faults(bodiless[0]) or pixel_faults(bodiless[1]) or mesh_faults(folder)):
-        # All is there and sound, only the body is not where the pictures have it; perhaps it can be said why.
+        # All is there and sound, only the body is not where the images have it; perhaps it can be said why.
         why = _why_elsewhere(contents)
     lines = [f"The capture {folder} cannot be used, it has {counted(len(found), 'fault')}:"]
     raise TwofoldError("\n".join([*lines, *([f"  {why}"] if why else []), *(f"  - {f}" for f in alike(found))]))
 
 
 def alike(faults: Sequence[str]) -> list[str]:
-    """Faults, of which those that differ in their moment alone become one.
+    """Faults, of which those that differ in their frame alone become one.
 
     >>> alike(["masks/a/000001.png is black.", "masks/a/000002.png is black.", "c is wrong."])
     ['masks/a/000001.png is black. (The same at times 2.)', 'c is wrong.']
@@ -269,7 +269,7 @@ def _doubts(
 
 
 def inverted(frame: FrameFacts) -> bool:
-    """Whether its mask covers most of the picture and of its border, as no person does."""
+    """Whether its mask covers most of the image and of its border, as no person does."""
     return frame.mask.share > 0.5 and frame.mask.border_share > 0.6
 
 
@@ -314,7 +314,7 @@ def _grouped(frames: Iterable[Frame]) -> dict[str, list[Frame]]:
 
 
 def _twins(capture: Capture) -> tuple[tuple[str, str, int], ...]:
-    """Test pictures that are training pictures under another name."""
+    """Test images that are training images under another name."""
     sizes: dict[int, list[Frame]] = defaultdict(list)
     for frame in capture.train:
         sizes[frame.image_file.stat().st_size].append(frame)
@@ -328,7 +328,7 @@ def _twins(capture: Capture) -> tuple[tuple[str, str, int], ...]:
 
 
 def _repeated(train: Sequence[Frame]) -> tuple[int, ...]:
-    """Moments whose picture is the one before, byte for byte, as frozen or stretched videos have them."""
+    """Frames whose image is the one before, byte for byte, as frozen or stretched videos have them."""
     found: list[int] = []
     ordered = sorted(train, key=lambda f: (f.camera_name, f.time))
     for one, other in itertools.pairwise(ordered):

@@ -1,4 +1,4 @@
-"""What a capture's motion shows without its pictures: jumps, how far limbs move, from which sides the body is seen."""
+"""What a capture's motion shows without its images: jumps, how far limbs move, from which sides the body is seen."""
 
 import itertools
 import math
@@ -40,10 +40,10 @@ class MotionFacts:
 
     Attributes:
         moments: that any split shows.
-        jumps: moments that no person could get to from the one before and after.
+        jumps: frames that no person could get to from the one before and after.
         jitter: how far joints stray from the middle between their neighbours, median, metres.
-        ranges: for each limb of `LIMBS` how far its joint turns between any two training moments, degrees.
-        poses: training moments whose poses differ from each other.
+        ranges: for each limb of `LIMBS` how far its joint turns between any two training frames, degrees.
+        poses: training frames whose poses differ from each other.
         azimuths: of the training cameras around the body, degrees; 0 in front, 90 at the person's left.
         elevations: of these cameras above the body's own horizon, degrees.
         turned: the arc that these azimuths span, degrees.
@@ -78,11 +78,11 @@ def motion_facts(
     """Measures a motion.
 
     Args:
-        poses: of every moment.
-        translations: of every moment, metres.
+        poses: of every frame.
+        translations: of every frame, metres.
         joints: of this person in the T-pose.
         splits: the capture's.
-        fps: moments per second.
+        fps: frames per second.
     """
     times = sorted({frame.time for frames in splits.values() for frame in frames})
     train = splits["train"]
@@ -146,7 +146,7 @@ def _directions(
 
 
 def _runs(times: Sequence[int], novel: Set[int]) -> list[list[int]]:
-    """Moments in stretches of one motion: a block of novel poses may be another motion, single ones in between not.
+    """Frames in stretches of one motion: a block of novel poses may be another motion, single ones in between not.
 
     >>> _runs([0, 1, 2, 3, 4, 5, 6, 7, 8, 9], {1, 6, 7, 8, 9})
     [[0, 1, 2, 3, 4, 5], [6, 7, 8, 9]]
@@ -166,12 +166,12 @@ def _runs(times: Sequence[int], novel: Set[int]) -> list[list[int]]:
 def _jumps(
     joints: Float[Tensor, "t 24 3"], roots: Float[Tensor, "t 3 3"], seconds: Float[np.ndarray, "t"]
 ) -> tuple[Bool[np.ndarray, "t"], Float[np.ndarray, "s"]]:
-    """Which moments are out of reach of both neighbours or of the one before, and by how much joints stray (metres).
+    """Which frames are out of reach of both neighbours or of the one before, and by how much joints stray (metres).
 
     Args:
         joints: the pelvis in the world, the others about it in the body's own axes, so that turning moves none.
         roots: the root's rotations.
-        seconds: of the moments.
+        seconds: of the frames.
     """
     count = len(joints)
     bad = np.zeros(count, bool)
@@ -181,7 +181,7 @@ def _jumps(
     weight = torch.as_tensor(after / (before + after), dtype=joints.dtype)[:, None, None]
     away = (joints[1:-1] - weight * joints[:-2] - (1 - weight) * joints[2:]).norm(dim=-1).numpy()
     excess = away.max(1) - (SLACK + 0.5 * ACCELERATION * before * after)
-    # Beside one wrong moment others stray by half as much; only the worst of a group is it.
+    # Beside one wrong frame others stray by half as much; only the worst of a group is it.
     worst = ndimage.maximum_filter1d(excess, 3, mode="nearest") == excess
     bad[1:-1] = (excess > 0) & worst
     bad[1:] |= _angles(roots[:-1].transpose(-1, -2) @ roots[1:]).numpy() > TURN_SPEED * np.diff(seconds)

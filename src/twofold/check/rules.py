@@ -22,7 +22,7 @@ DISTANCES = (0.3, 30.0)
 VIEW_ANGLES = (8.0, 110.0)
 """Degrees: a long telephoto lens and an action camera. Beyond these, a made-up focal length (5000, say) is likelier."""
 ODD_PIXELS, OFF_CENTER = 0.05, 0.15
-"""fy against fx; distance of the principal point from the picture's middle, in picture lengths."""
+"""fy against fx; distance of the principal point from the image's middle, in image lengths."""
 BRIGHTER = 1.3
 """Ratio of the brightnesses of a background: a third of an aperture stop."""
 HARD, SOFT, RAGGED, GRAIN = 0.05, 0.03, 0.0015, 0.012
@@ -33,7 +33,7 @@ LOOSE = 0.05
 CROPPED, CUT_OFF = 0.1, 0.3
 """Share of the frames that may touch the border; share of the body that may be outside on average."""
 FEWEST, FEW = 8, 20
-"""Training pictures: fewer cannot tell pose from chance; from the second on it begins to work."""
+"""Training images: fewer cannot tell pose from chance; from the second on it begins to work."""
 JITTER = 0.03
 """Metres; trembling by more than a finger's breadth and a half is no motion."""
 SMALL, FINE = 64, 200
@@ -95,7 +95,7 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
             "warning",
             "focal length",
             f"The camera sees {camera.view_angle:.3g} degrees across, which no usual lens does",
-            "Check the focal length: in pixels, of these pictures and not of larger ones, and not made up.",
+            "Check the focal length: in pixels, of these images and not of larger ones, and not made up.",
             where,
         )
     if abs(np.log(camera.aspect)) > ODD_PIXELS:
@@ -110,8 +110,8 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
         yield Finding(
             "note",
             "principal point",
-            f"The principal point lies {camera.off_center:.0%} of the picture's length off its middle",
-            "That is right for cropped pictures; else check cx and cy.",
+            f"The principal point lies {camera.off_center:.0%} of the image's length off its middle",
+            "That is right for cropped images; else check cx and cy.",
             where,
         )
     if not DISTANCES[0] <= camera.distance <= DISTANCES[1]:
@@ -160,7 +160,7 @@ def _masks(facts: Facts) -> Iterator[Finding]:
             "warning",
             "jagged masks",
             f"Outlines go in steps of {grain:.0f} pixels, as enlarged small masks do",
-            "Make masks at the pictures' own size, or enlarge them smoothly.",
+            "Make masks at the images' own size, or enlarge them smoothly.",
         )
     loose = [f for f in frames if f.mask.loose > LOOSE]
     if loose:
@@ -177,7 +177,7 @@ def _masks(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "note",
             "held objects",
-            f"In {counted(len(hidden), 'picture')} a part of the person is ignored, as if an object hid it: at most "
+            f"In {counted(len(hidden), 'image')} a part of the person is ignored, as if an object hid it: at most "
             f"{worst.ignored:.1%}, on average {sum(f.ignored for f in frames) / len(frames):.1%} of the mask",
             "Compare the overlays: ignored parts are purple. If they show the person's own body, prepare again with "
             "--held-objects keep.",
@@ -190,9 +190,9 @@ def _masks(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             graded(outside > CUT_OFF),
             "cropped",
-            f"In {counted(len(cropped), 'picture')} the person runs out at the {', '.join(sides)}; on average "
+            f"In {counted(len(cropped), 'image')} the person runs out at the {', '.join(sides)}; on average "
             f"{f'{outside:.0%}' if outside >= 0.005 else 'less than 1%'} of the body is outside",
-            "Use pictures that show all of the person; what is never seen is made up.",
+            "Use images that show all of the person; what is never seen is made up.",
             places(cropped),
         )
 
@@ -211,8 +211,8 @@ def _sides_and_poses(facts: Facts) -> Iterator[Finding]:
     if train < FEW:
         yield Finding(
             graded(train < FEWEST),
-            "few pictures",
-            f"There are {train} training pictures only",
+            "few images",
+            f"There are {train} training images only",
             f"Take {FEW} or more, from all sides and in different poses.",
         )
     still = [name for (name, _), turn in zip(LIMBS, motion.ranges, strict=True) if turn < STILL]
@@ -234,7 +234,7 @@ def _sides_and_poses(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "note",
             "novel poses",
-            f"No joint of a novel_pose moment is turned by more than {motion.novelty:.0f} degrees against the nearest "
+            f"No joint of a novel_pose frame is turned by more than {motion.novelty:.0f} degrees against the nearest "
             "training pose (median)",
             "Figures will tell how well frames in between are met, not how well new poses are.",
         )
@@ -255,7 +255,7 @@ def _motion(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             graded(len(trained) > MOST_BAD * len(motion.moments)),
             "jumps",
-            f"{counted(len(trained), 'moment')} cannot be reached in time from the one before: failed or exchanged "
+            f"{counted(len(trained), 'frame')} cannot be reached in time from the one before: failed or exchanged "
             "frames, or a wrong `fps`",
             "Fit these again, or leave them out: check --write-splits, or prepare --drop FRAMES.",
             f"times {spans(trained)}",
@@ -265,7 +265,7 @@ def _motion(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "note",
             "jumps",
-            f"{counted(len(rest), 'test moment')} cannot be reached in time from the one before",
+            f"{counted(len(rest), 'test frame')} cannot be reached in time from the one before",
             "Figures measured there may be too low.",
             f"times {spans(rest)}",
         )
@@ -273,7 +273,7 @@ def _motion(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "jitter",
-            f"Joints tremble by {100 * motion.jitter:.1f} cm from moment to moment",
+            f"Joints tremble by {100 * motion.jitter:.1f} cm from frame to frame",
             "Smooth the poses over time, or check `fps`.",
         )
 
@@ -285,8 +285,8 @@ def _backgrounds(facts: Facts) -> Iterator[Finding]:
             yield Finding(
                 "warning",
                 "moving camera",
-                f"The background moves by {background.shift:.1%} of the picture, so the camera does not stand still",
-                "Poses must be relative to the camera at each moment, and light that stays in the world will blur; "
+                f"The background moves by {background.shift:.1%} of the image, so the camera does not stand still",
+                "Poses must be relative to the camera in each frame, and light that stays in the world will blur; "
                 "film from a tripod.",
                 f"camera {name}",
             )
@@ -303,7 +303,7 @@ def _backgrounds(facts: Facts) -> Iterator[Finding]:
                 "warning",
                 "exposure",
                 f"The brightness of the background changes by a factor of {max(ratios) / min(ratios):.2g}",
-                "Lock exposure and white balance, or equalise the pictures.",
+                "Lock exposure and white balance, or equalise the images.",
                 f"camera {name}",
             )
 
@@ -313,15 +313,15 @@ def _pictures(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "overlap",
-            f"{counted(len(facts.twins), 'test picture')} equal to a training picture, byte for byte",
+            f"{counted(len(facts.twins), 'test image')} equal to a training image, byte for byte",
             "Take each out of one split; what is measured there is memory.",
             places_of((camera, time) for _, camera, time in facts.twins),
         )
     if facts.repeated:
         yield Finding(
             "warning",
-            "repeated pictures",
-            f"{counted(len(facts.repeated), 'training picture')} equal to the one before, as in stretched videos",
+            "repeated images",
+            f"{counted(len(facts.repeated), 'training image')} equal to the one before, as in stretched videos",
             "Leave them out, and check `fps`.",
             f"times {spans(facts.repeated)}",
         )
@@ -331,7 +331,7 @@ def _pictures(facts: Facts) -> Iterator[Finding]:
             "warning" if tall < SMALL else "note",
             "resolution",
             f"The person is {tall:.0f} pixels tall: {100 * facts.stature / max(tall, 1e-6):.1f} cm a pixel",
-            "Finer things cannot be learned; use larger pictures where there are any.",
+            "Finer things cannot be learned; use larger images where there are any.",
         )
     groups: dict[str, list[FrameFacts]] = defaultdict(list)
     for frame in facts.frames:
@@ -342,7 +342,7 @@ def _pictures(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "note",
             "blur",
-            f"{counted(len(blurred), 'picture')} much less sharp than the others",
+            f"{counted(len(blurred), 'image')} much less sharp than the others",
             "Leave out what is blurred.",
             places(blurred),
         )

@@ -25,8 +25,8 @@ def studio(
     Args:
         out: Folder to make.
         seed: Who, wearing what, moving how.
-        size: Rows and columns of the pictures.
-        frames: Moments; the last fifth shows a motion that is not trained on.
+        size: Rows and columns of the images.
+        frames: Frames; the last fifth shows a motion that is not trained on.
         cameras: In a ring around the person; the first one trains.
         pose_noise: Error of the given poses, radians (standard deviation).
         mask_noise: Faults of the masks, 0 to 1.
@@ -58,7 +58,7 @@ def import_capture(
         drop_below_iou: Leaves out frames whose fitted body covers the mask worse than this, 0 to 1.
         held_objects: Whether a ball or the like that moves apart from the body is taken out of the masks.
         fps: Frames a second; by default what capture.npz says, else 30.
-        credit: Whom to name when showing the pictures.
+        credit: Whom to name when showing the images.
     """
     from twofold.prepare.import_fitted import import_prepared
 
@@ -91,27 +91,27 @@ def prepare(
     drop: str | None = None,
     credit: str = "",
 ) -> None:
-    """Makes a capture folder from a video of one person, or from several of the same moments.
+    """Makes a capture folder from a video of one person, or from several synchronised ones.
 
     Args:
-        videos: A video file or a folder of pictures; several need --calibration.
+        videos: A video file or a folder of images; several need --calibration.
         out: Capture folder to make.
         calibration: Cameras of several videos: Qualisys .qca.txt, intri.yml and extri.yml, Pose2Sim .toml, or JSON.
-        fps: Pictures a second to use; by default all.
-        max_size: Longer side of the pictures in pixels; larger ones are made smaller.
+        fps: Images a second to use; by default all.
+        max_size: Longer side of the images in pixels; larger ones are made smaller.
         intrinsics: fx,fy,cx,cy of the one camera in pixels of its video; found roughly where not given.
         body: anny, or your own SMPL file.
         masks: Your own masks instead of the estimator's: a folder (one folder for each of several videos in it).
         landmarks: Your own landmarks: a file (a folder with one file for each of several videos).
         poses: Your own poses of the body, as npz with poses, translations and betas; nothing is fitted then.
         train_camera: Which of several videos trains; by default the first.
-        held_out: Of so many moments one is kept for testing.
+        held_out: Of so many frames one is kept for testing.
         held_objects: Whether a ball or the like that moves apart from the body is taken out of the masks.
         several_people: Whether a second person in view ends it, or whoever is found is taken.
         person: Which of several people is meant: the largest, a number (1 is the leftmost in the first image), or the
             one in your own masks; by default the one in your own masks, landmarks or poses.
         drop: Frames to leave out of the splits, such as 3,7-9.
-        credit: Whom to name when showing the pictures.
+        credit: Whom to name when showing the images.
     """
     from twofold.prepare.detect.blazepose import mediapipe_estimator
     from twofold.prepare.detect.people import count_people

@@ -42,7 +42,7 @@ from twofold.training.loop import Progress, train
 from twofold.training.run import CHECKPOINT, RECIPE
 
 SIZE, FRAMES, CAMERAS = 192, 50, 4
-"""Of the demo's capture: 40 moments to train on, 10 with another motion, one camera to train on and three to test."""
+"""Of the demo's capture: 40 frames to train on, 10 with another motion, one camera to train on and three to test."""
 
 MARK = "demo.json"
 """The file by which a demo knows its own folder."""
@@ -159,7 +159,7 @@ def _pictures(avatar: Avatar, capture: Capture, out: Path) -> list[Path]:
 
 
 def _one_each(frames: tuple[Frame, ...]) -> list[Frame]:
-    """One frame of each camera, at moments spread over the split."""
+    """One frame of each camera, in frames spread over the split."""
     cameras = sorted({frame.camera_name for frame in frames})
     chosen = []
     for number, camera in enumerate(cameras):

@@ -146,9 +146,9 @@ def render(
     Args:
         run: Run folder.
         what: Everything, or one part.
-        size: Rows of the pictures of the orbit and of the canonical pose, 16 to 4096.
+        size: Rows of the images of the orbit and of the canonical pose, 16 to 4096.
         capture: Capture folder, if it has moved since training.
-        out: Folder for the pictures; by default RUN/renders. With --motion a video or a folder.
+        out: Folder for the images; by default RUN/renders. With --motion a video or a folder.
         chunk: Rays at once; by default as many as the free memory holds.
         device: auto, cpu, cuda or cuda:N.
         motion_video: A video of a motion; the others need --motion.

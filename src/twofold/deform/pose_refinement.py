@@ -30,13 +30,13 @@ class KnownPoses(Protocol):
 
 
 class PoseRefinement(nn.Module):
-    """One correction a training moment (root, body, translation) and one for the shape; all start at zero.
+    """One correction a training frame (root, body, translation) and one for the shape; all start at zero.
 
     The correction is added to the axis-angle numbers, which is what optimising the stored poses themselves would do.
     """
 
     def __init__(self, times: Int[Tensor, "T"], shapes: int, parts: tuple[str, ...]) -> None:
-        """Tables for the moments `times`; `parts` names what may change: "root", "body", "translation", "shape"."""
+        """Tables for the frames `times`; `parts` names what may change: "root", "body", "translation", "shape"."""
         super().__init__()
         count = len(times)
         self.rows = {int(time): row for row, time in enumerate(times)}
@@ -49,7 +49,7 @@ class PoseRefinement(nn.Module):
     def forward(
         self, time: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"]
     ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
-        r"""The corrected pose and translation of a moment; moments it does not know stay as they are.
+        r"""The corrected pose and translation of a frame; frames it does not know stay as they are.
 
         \[ \theta' = \theta + \Delta\theta_t, \qquad \tau' = \tau + \Delta\tau_t \]
 
@@ -93,9 +93,9 @@ class PoseRefinement(nn.Module):
         pose: Float[Tensor, "24 3"],
         translation: Float[Tensor, "3"],
     ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
-        r"""A moment that was not trained on, corrected by what its neighbours in time were corrected by.
+        r"""A frame that was not trained on, corrected by what its neighbours in time were corrected by.
 
-        An estimator's errors last longer than a moment. Nothing of the moment's own picture is used. With
+        An estimator's errors last longer than a frame. Nothing of the frame's own image is used. With
         $u = (t - t_0) / (t_1 - t_0)$ and the corrections $R_i$ and $\Delta\tau_i$ of the neighbours,
 
         \[ R' = \exp\big((1 - u) \log R_0 + u \log R_1\big) \, R, \qquad
@@ -108,9 +108,9 @@ class PoseRefinement(nn.Module):
         tensor([0.2500, 0.2500, 0.2500], grad_fn=<AddBackward0>)
 
         Args:
-            neighbours: the moments before and after it that were trained on, each with its pose and translation as
+            neighbours: the frames before and after it that were trained on, each with its pose and translation as
                 given.
-            time: the moment between them.
+            time: the frame between them.
             pose: as given, radians.
             translation: as given, metres.
         """
@@ -130,7 +130,7 @@ class PoseRefinement(nn.Module):
 
         \[ \sqrt{ \tfrac{1}{n} \sum_i \lVert \Delta_i \rVert^2 } \]
 
-        over moments (and joints); of the shape the norm.
+        over frames (and joints); of the shape the norm.
 
         >>> refinement = PoseRefinement(torch.tensor([0, 4]), 10, ("translation",))
         >>> refinement.translation.data[0, 0] = 0.2

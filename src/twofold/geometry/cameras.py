@@ -1,7 +1,7 @@
 """Pinhole cameras and their rays (OpenCV axes: x right, y down, z forward).
 
 Pixel (column i, row j) is the point (i, j) of the image plane, without a half-pixel offset, as in every data set of the
-field; a picture's left edge therefore lies at -0.5.
+field; an image's left edge therefore lies at -0.5.
 """
 
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ class Camera:
     Attributes:
         world_to_camera: rigid transform, metres.
         intrinsics: pixels.
-        height: rows of its pictures.
-        width: columns of its pictures.
+        height: rows of its images.
+        width: columns of its images.
     """
 
     world_to_camera: Float[Tensor, "4 4"]
@@ -37,7 +37,7 @@ class Camera:
         return Camera(self.world_to_camera.to(device), self.intrinsics.to(device), self.height, self.width)
 
     def resized(self, height: int, width: int) -> "Camera":
-        """The same view in another picture size; whole-pixel-area exact, so with the half-pixel terms."""
+        """The same view in another image size; whole-pixel-area exact, so with the half-pixel terms."""
         scale = torch.tensor([width / self.width, height / self.height], dtype=self.intrinsics.dtype)
         scaled = self.intrinsics.clone()
         scaled[:2] = self.intrinsics[:2] * scale[:, None].to(self.intrinsics.device)

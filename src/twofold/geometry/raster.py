@@ -1,4 +1,4 @@
-"""Triangles to pictures: which surface point does each pixel see?
+"""Triangles to images: which surface point does each pixel see?
 
 A z-buffer over all triangles at once. Meshes of a person have triangles about as small as a pixel, and for those a list
 of (triangle, pixel) pairs is far quicker than building a tree for ray casting anew in every pose.
@@ -53,7 +53,7 @@ def rasterize(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor,
     x0, x1, x2 = (projected[:, 0].index_select(0, corner) for corner in corners)
     y0, y1, y2 = (projected[:, 1].index_select(0, corner) for corner in corners)
     doubled_area = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
-    # The picture's y axis points down, so a triangle seen from outside turns the other way there.
+    # The image's y axis points down, so a triangle seen from outside turns the other way there.
     turned = doubled_area < -1e-12 if cull else doubled_area.abs() > 1e-12
     left, right = _pixels_between(x0, x1, x2, camera.width)
     top, bottom = _pixels_between(y0, y1, y2, camera.height)

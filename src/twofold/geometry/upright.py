@@ -13,7 +13,7 @@ def turn_world(
     translations: Float[Tensor, "T 3"],
     world_to_camera: Float[Tensor, "4 4"],
 ) -> tuple[Float[Tensor, "T 24 3"], Float[Tensor, "T 3"], Float[Tensor, "4 4"]]:
-    """Motion and camera in a turned world, so that every picture stays the same.
+    """Motion and camera in a turned world, so that every image stays the same.
 
     Args:
         rotation: from the old world's axes to the new ones.

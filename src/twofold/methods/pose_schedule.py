@@ -22,18 +22,18 @@ class PoseConfig:
     zero_until: int = 10_000
     """The branch sees a zero pose before this step."""
     zero_every: int = 50
-    """Afterwards it sees a zero pose during every epoch (a step a moment) whose number this divides; 0 for never."""
+    """Afterwards it sees a zero pose during every epoch (a step a frame) whose number this divides; 0 for never."""
     drop: float = 0.0
     """Chance of a zero pose at any training step (ours; the schedule above is the release's)."""
     epochs: Literal["moments", "training"] = "moments"
-    """Epochs of `zero_every`: "moments", one step for each moment; "training", those of the training, as released."""
+    """Epochs of `zero_every`: "moments", one step for each frame; "training", those of the training, as released."""
     refine: tuple[Literal["root", "body", "translation", "shape"], ...] = ("root", "body", "translation", "shape")
     refine_from: int = 0
     """First step at which poses are corrected."""
     canonical_shape: Literal["refined", "given"] = "refined"
     """Whose joints bones leave canonical space from: the corrected shape's, or, as released, those of the one given."""
     test_shape: Literal["refined", "given"] = "refined"
-    """Shape of poses that are no training moments: the corrected one, or, as released, the one given."""
+    """Shape of poses that are no training frames: the corrected one, or, as released, the one given."""
 
     def __post_init__(self) -> None:
         """Refuses chances and steps that there are not."""

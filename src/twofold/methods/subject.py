@@ -20,7 +20,7 @@ class Subject:
     Attributes:
         body: the body model.
         betas: its shape coefficients.
-        times: moments of the training frames, ascending.
+        times: frame indices of the training images, ascending.
         poses: their axis-angle rotations, radians.
         translations: their translations, metres.
         scene_scale: what the authors' release multiplies lengths with (3 / (1.1 times the furthest camera)).

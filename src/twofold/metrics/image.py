@@ -1,7 +1,7 @@
-"""How close a rendered picture is to a photograph: PSNR, SSIM, silhouette overlap.
+"""How close a rendered image is to a photograph: PSNR, SSIM, silhouette overlap.
 
-Every figure is of the pictures as they are stored, rounded to 8 bit, so it can be measured again from the PNG files.
-Pictures hold colours in 0..1.
+Every figure is of the images as they are stored, rounded to 8 bit, so it can be measured again from the PNG files.
+Images hold colours in 0..1.
 """
 
 import math
@@ -14,15 +14,15 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from twofold.errors import TwofoldError
 
 PSNR_CEILING = 100.0
-"""dB given to equal pictures, so that means and files stay finite."""
+"""dB given to equal images, so that means and files stay finite."""
 SSIM_WINDOW = 7
 """Pixels along one side."""
 PROTOCOLS = {
     "psnr": "-10 log10 of the mean squared error over all pixels and channels, 8 bit, at most 100 dB",
     "psnr_box": "PSNR over the bounding box of the true mask (> 0.5), background included",
-    "ssim": "structural similarity, whole picture, 8 bit, 7x7 uniform window per channel, data range 1",
+    "ssim": "structural similarity, whole image, 8 bit, 7x7 uniform window per channel, data range 1",
     "ssim_box": "the same SSIM over the bounding box of the true mask (> 0.5)",
-    "ssim_range_2": "the same SSIM of the whole picture with data range 2, as older programs compute it for floats",
+    "ssim_range_2": "the same SSIM of the whole image with data range 2, as older programs compute it for floats",
     "silhouette_iou": "intersection over union of opacity > 0.5 and the true mask > 0.5",
 }
 """What each number of `compare` is, in one line."""
@@ -43,14 +43,14 @@ def to_8bit(image: Float[Tensor, "*b"]) -> UInt8[Tensor, "*b"]:
         ValueError: a colour is not a number.
     """
     if image.isnan().any():
-        raise ValueError("the picture holds NaN")
+        raise ValueError("the image holds NaN")
     return image.clamp(0, 1).mul(255).round().to(torch.uint8)
 
 
 def psnr(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None
 ) -> float:
-    """Peak signal-to-noise ratio in dB, over the whole picture or the pixels of `mask`."""
+    """Peak signal-to-noise ratio in dB, over the whole image or the pixels of `mask`."""
     squared = (_stored(image) - _stored(truth)).square()
     error = (squared if mask is None else squared[mask]).mean().item()
     return min(-10 * math.log10(error), PSNR_CEILING) if error > 0 else PSNR_CEILING
@@ -65,7 +65,7 @@ def ssim(
     """Structural similarity, as scikit-image defines it: uniform window, unbiased covariances, mean of the channels.
 
     Args:
-        image: the picture.
+        image: the image.
         truth: what it should be.
         data_range: 1 for colours in 0..1; 2 repeats what programs of the field got for floats without naming a range.
         ignored: pixels that count nowhere: the mean is over the windows that touch none of them.
@@ -75,7 +75,7 @@ def ssim(
     """
     if min(image.shape[:2]) < SSIM_WINDOW:
         size = "x".join(str(n) for n in image.shape[:2])
-        raise TwofoldError(f"SSIM needs at least 7x7 pixels, it got {size}; use larger pictures.")
+        raise TwofoldError(f"SSIM needs at least 7x7 pixels, it got {size}; use larger images.")
     x, y = _stored(image).movedim(-1, 0), _stored(truth).movedim(-1, 0)
 
     def mean(values: Tensor) -> Tensor:
@@ -99,7 +99,7 @@ def ssim(
 
 
 def subject_box(mask: Float[Tensor, "h w"], margin: int = 0) -> tuple[slice, slice]:
-    """Rows and columns that bound the mask (> 0.5), widened by `margin` pixels but not beyond the picture.
+    """Rows and columns that bound the mask (> 0.5), widened by `margin` pixels but not beyond the image.
 
     Raises:
         TwofoldError: the mask is empty.
@@ -160,7 +160,7 @@ def compare(
     mask: Float[Tensor, "h w"],
     ignored: Bool[Tensor, "h w"] | None = None,
 ) -> dict[str, float]:
-    """All figures of one picture, named as in `PROTOCOLS`; pixels that are `ignored` count in none of them."""
+    """All figures of one image, named as in `PROTOCOLS`; pixels that are `ignored` count in none of them."""
     if ignored is not None and not ignored.any():
         ignored = None
     return {

@@ -1,4 +1,4 @@
-"""LPIPS: how different two pictures look to a network that knows photographs (Zhang et al. 2018).
+"""LPIPS: how different two images look to a network that knows photographs (Zhang et al. 2018).
 
 Its weights are two files that others have published and that do not come with this package; `weights_hint` says which.
 """
@@ -28,7 +28,7 @@ _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
 
 class LPIPS(nn.Module):
-    """Perceptual distance over VGG16 features, version 0.1. Its weights are fixed; gradients reach the pictures.
+    """Perceptual distance over VGG16 features, version 0.1. Its weights are fixed; gradients reach the images.
 
     Args:
         channels: of the network's convolutions, block by block; VGG16's unless a test wants a small one.
@@ -54,7 +54,7 @@ class LPIPS(nn.Module):
         self, first: Float[Tensor, "n 3 h w"], second: Float[Tensor, "n 3 h w"], dropout: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> Float[Tensor, "n"]:  # fmt: skip
-        """Distance of each pair of pictures, 0 for equal ones.
+        """Distance of each pair of images, 0 for equal ones.
 
         Args:
             first: colours 0..1, at least 16 pixels high and wide.
@@ -63,7 +63,7 @@ class LPIPS(nn.Module):
             generator: draws which are left out.
         """
         if min(first.shape[-2:]) < 16:
-            raise ValueError(f"LPIPS needs pictures of at least 16 x 16 pixels, these have {tuple(first.shape[-2:])}")
+            raise ValueError(f"LPIPS needs images of at least 16 x 16 pixels, these have {tuple(first.shape[-2:])}")
         # One pass over both: convolutions are faster on larger batches.
         x = (2 * torch.cat([first, second]) - 1 - self.shift) / self.scale
         distance = torch.zeros_like(first[:, 0, 0, 0])

@@ -1,4 +1,4 @@
-"""The pictures that show a run: orbit, unseen views, unseen poses, canonical front and back."""
+"""The images that show a run: orbit, unseen views, unseen poses, canonical front and back."""
 
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -35,7 +35,7 @@ def save_png(path: Path, image: UInt8[np.ndarray, "h w *c"]) -> None:
 
 
 def save_preview(avatar: Avatar, capture: Capture, folder: Path, step: int) -> None:
-    """Writes previews/STEP.png: a training picture, the avatar's and its normals, at most 256 pixels high."""
+    """Writes previews/STEP.png: a training image, the avatar's and its normals, at most 256 pixels high."""
     frame = capture.train[(step // 7) % len(capture.train)]
     height = min(256, frame.camera.height)
     camera = frame.camera.resized(height, round(frame.camera.width * height / frame.camera.height))
@@ -50,7 +50,7 @@ def _background(capture: Capture) -> Tensor:
 
 
 def panels(picture: Picture) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
-    """What a rendering is made of, as pictures: full, base, residual, normals of both, opacity."""
+    """What a rendering is made of, as images: full, base, residual, normals of both, opacity."""
     parts = {
         "full": picture.color,
         "base": picture.base,
@@ -65,7 +65,7 @@ def panels(picture: Picture) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
 def beside_truth(
     avatar: Avatar, capture: Capture, frame: Frame, chunk: int | None = None
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Picture]:
-    """A frame's own picture on the background, and the avatar's."""
+    """A frame's own image on the background, and the avatar's."""
     background = _background(capture)
     posed = avatar.pose(frame.pose, frame.translation)
     picture = draw(avatar, posed, frame.camera, background, chunk)
@@ -73,7 +73,7 @@ def beside_truth(
 
 
 def shown_truth(frame: Frame, background: Float[Tensor, "3"]) -> Float[Tensor, "h w 3"]:
-    """A frame's own picture on the background; what is ignored there is hatched in grey."""
+    """A frame's own image on the background; what is ignored there is hatched in grey."""
     ignored = frame.ignored()
     rows, columns = (torch.arange(size) for size in ignored.shape)
     hatch = torch.where((rows[:, None] + columns) % 6 < 2, 0.75, 0.5)[..., None]
@@ -101,7 +101,7 @@ def comparison(
 
 
 def _around(mask: Float[Tensor, "h w"]) -> tuple[slice, slice]:
-    """The person's box and a little room; the whole picture where nobody is."""
+    """The person's box and a little room; the whole image where nobody is."""
     return subject_box(mask, margin=6) if (mask > 0.5).any() else (slice(None), slice(None))
 
 
@@ -109,7 +109,7 @@ def orbit_frames(
     avatar: Avatar, posed: PosedAvatar, capture: Capture, size: int, views: int, up: Float[Tensor, "3"] | None = None,
     chunk: int | None = None,
 ) -> Iterator[Picture]:  # fmt: skip
-    """Pictures from all around."""
+    """Images from all around."""
     for camera in orbit(posed, size, views, up):
         yield draw(avatar, posed, camera, _background(capture), chunk)
 
@@ -146,10 +146,10 @@ def render_run(
         capture: for cameras, poses and truth.
         folder: gets orbit.mp4, orbit/, novel_view.png, novel_pose.png, novel_pose.mp4, canonical.png.
         what: "all", "orbit", "views", "poses" or "canonical".
-        size: edge of orbit and canonical pictures, pixels.
+        size: edge of orbit and canonical images, pixels.
         chunk: rays at once; None as many as memory allows.
         show: told the share that is done.
-        views: pictures of the orbit.
+        views: images of the orbit.
 
     Raises:
         TwofoldError: the capture has no frames for the one part that was asked for, or the folder cannot be written.
@@ -157,7 +157,7 @@ def render_run(
     splits = {"views": "novel_view", "poses": "novel_pose"}
     if what in splits and not capture.splits.get(splits[what]):
         raise TwofoldError(
-            f"{capture.folder} has no pictures in its split {splits[what]}, so there is nothing to compare with; "
+            f"{capture.folder} has no images in its split {splits[what]}, so there is nothing to compare with; "
             "draw the orbit or the canonical pose instead."
         )
     background = _background(capture)
@@ -196,7 +196,7 @@ def render_run(
 
 
 def _pieces(capture: Capture, what: str, size: int, views: int) -> tuple[dict[str, int], dict[str, float]]:
-    """How many pictures of each kind `render_run` draws, and their sizes beside each other, pixels."""
+    """How many images of each kind `render_run` draws, and their sizes beside each other, pixels."""
     seen, posed = (capture.splits.get(split, ()) for split in ("novel_view", "novel_pose"))
     moments = {frame.time: frame.camera for frame in posed}
     counts = {

@@ -1,4 +1,4 @@
-"""Fast pictures of an exported character: its textured mesh, drawn by a compiled rasterizer on the CPU."""
+"""Fast images of an exported character: its textured mesh, drawn by a compiled rasterizer on the CPU."""
 
 import numpy as np
 import torch

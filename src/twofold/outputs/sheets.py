@@ -1,4 +1,4 @@
-"""Pictures side by side with labels, and pictures of what has no colour of its own: normals, differences."""
+"""Images side by side with labels, and images of what has no colour of its own: normals, differences."""
 
 from collections.abc import Sequence
 from typing import TypeAlias
@@ -27,24 +27,24 @@ def sheet(
     footer: str = "",
     height: int | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A table of pictures on white, labelled above the columns and left of the rows.
+    """A table of images on white, labelled above the columns and left of the rows.
 
     Args:
-        rows: pictures, or None for an empty place; rows may differ in length.
+        rows: images, or None for an empty place; rows may differ in length.
         row_labels: one for each row, or none; long ones are broken between words.
         column_labels: one for each column, or none.
         title: above it all.
         footer: below it all, for credit and explanation.
-        height: of every picture in pixels; by default that of the tallest. Widths follow.
+        height: of every image in pixels; by default that of the tallest. Widths follow.
 
     Raises:
-        ValueError: there is no picture, or the labels do not match the table.
+        ValueError: there is no image, or the labels do not match the table.
     """
     pictures = [[None if p is None else as_bytes(p) for p in row] for row in rows]
     present = [p for row in pictures for p in row if p is not None]
     columns = max((len(row) for row in rows), default=0)
     if not present:
-        raise ValueError("a sheet needs at least one picture")
+        raise ValueError("a sheet needs at least one image")
     for labels, count, name in ((row_labels, len(rows), "row"), (column_labels, columns, "column")):
         if labels and len(labels) != count:
             raise ValueError(f"the sheet has {count} {name}s, but {len(labels)} {name} labels came")
@@ -108,7 +108,7 @@ def residual_picture(
 
 
 def as_bytes(picture: Picture) -> UInt8[np.ndarray, "h w 3"]:
-    """Any picture as three bytes a pixel; shades become grey."""
+    """Any image as three bytes a pixel; shades become grey."""
     if isinstance(picture, np.ndarray):
         return picture
     stored = to_8bit(picture).cpu().numpy()

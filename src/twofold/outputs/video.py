@@ -1,4 +1,4 @@
-"""Pictures as an MP4 that browsers, slides and phones play."""
+"""Images as an MP4 that browsers, slides and phones play."""
 
 from collections.abc import Iterable
 from fractions import Fraction
@@ -31,7 +31,7 @@ def write_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 3"]], 
     Args:
         path: ends in .mp4.
         frames: all of one size.
-        fps: pictures per second.
+        fps: images per second.
 
     Raises:
         ValueError: there is no frame, or one has another size than the first.

@@ -1,4 +1,4 @@
-"""Pictures of an avatar: any camera, any pose, either branch."""
+"""Images of an avatar: any camera, any pose, either branch."""
 
 import math
 from collections.abc import Iterator
@@ -53,7 +53,7 @@ def rays_at_once(device: torch.device) -> int:
 def draw(
     avatar: Avatar, posed: PosedAvatar, camera: Camera, background: Float[Tensor, "3"], chunk: int | None = None
 ) -> Picture:
-    """Renders a picture; rays that miss the body's surroundings are background without being followed.
+    """Renders an image; rays that miss the body's surroundings are background without being followed.
 
     Args:
         avatar: whom.
@@ -95,7 +95,7 @@ def draw(
 
 
 def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    """World-to-camera transform of a camera at `eye` that looks at `target`, `up` pointing up in its picture."""
+    """World-to-camera transform of a camera at `eye` that looks at `target`, `up` pointing up in its image."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
     down = torch.linalg.cross(forward, right)
@@ -119,7 +119,7 @@ def orbit(
 
     Args:
         posed: whom to look at.
-        size: edge of the square pictures, pixels.
+        size: edge of the square images, pixels.
         views: how many, evenly spaced.
         up: axis of the circle; None takes the body's own.
         start: angle of the first one from the body's front, radians.

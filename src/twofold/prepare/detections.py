@@ -1,4 +1,4 @@
-"""What is seen in a clip: where a person's landmarks are in each picture, and which pixels the person covers."""
+"""What is seen in a clip: where a person's landmarks are in each image, and which pixels the person covers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ def mirrored_landmarks() -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Observation:
-    """One person in one picture.
+    """One person in one image.
 
     Attributes:
         pixels: (column, row) of each landmark; NaN where it was not looked for or nobody was found.
@@ -44,10 +44,10 @@ class Observation:
 
 @runtime_checkable
 class Estimator(Protocol):
-    """Finds one person in the pictures of a clip, which come in order."""
+    """Finds one person in the images of a clip, which come in order."""
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"], seconds: float) -> Observation:
-        """The person in the picture taken `seconds` after the clip's start (8-bit sRGB)."""
+        """The person in the image taken `seconds` after the clip's start (8-bit sRGB)."""
         ...
 
     def close(self) -> None:
@@ -65,7 +65,7 @@ class Track:
 
     @property
     def found(self) -> Bool[np.ndarray, "t"]:
-        """Moments at which the person was found."""
+        """Frames at which the person was found."""
         return np.any(self.visibility > 0, axis=1)
 
     def __len__(self) -> int:
@@ -73,7 +73,7 @@ class Track:
 
 
 def track_of(observations: Sequence[Observation]) -> Track:
-    """The landmarks of pictures in order, without the masks."""
+    """The landmarks of images in order, without the masks."""
     return Track(
         np.stack([o.pixels for o in observations]),
         np.stack([o.visibility for o in observations]),

@@ -67,15 +67,15 @@ def import_prepared(
         overwrite: a capture that lies at `out` gives way.
         held_objects: "remove" takes what is thick and sticks out of the body, such as a ball, out of the masks, and
             marks it and what passes in front of the body as ignored; "keep" leaves the masks as they are.
-        fps: moments per second; None takes `fps` of capture.npz, else 30, and says so.
-        credit: whom to name when showing the pictures.
+        fps: frames per second; None takes `fps` of capture.npz, else 30, and says so.
+        credit: whom to name when showing the images.
         remark: told each sentence that the user should know.
 
     Returns:
         `out`.
 
     Raises:
-        TwofoldError: an array or picture is missing or of the wrong shape, a picture or mask cannot be read or does not
+        TwofoldError: an array or image is missing or of the wrong shape, an image or mask cannot be read or does not
             show the fitted body, or `out` cannot be written; nothing is left behind then.
     """
     source, out = Path(source), Path(out)
@@ -182,7 +182,7 @@ def _files(
     missing = [time for time in times if time not in found[0].places]
     if missing:
         raise TwofoldError(
-            f"{folder} lacks the pictures of frames {spans(missing)} ({missing[0]:04d} and so on); "
+            f"{folder} lacks the images of frames {spans(missing)} ({missing[0]:04d} and so on); "
             f"{ARRAYS} has poses for them, so add them or prepare the capture again."
         )
     return {time: found[0].places[time] for time in times}
@@ -206,7 +206,7 @@ def _as_stored(file: Path, values: MaskValues) -> bool:
 
 @contextlib.contextmanager
 def _named_as_given(images: dict[int, Path], masks: dict[int, Path]) -> Generator[None, None, None]:
-    """Faults of pictures under the names that they have in the prepared folder, where they can be mended."""
+    """Faults of images under the names that they have in the prepared folder, where they can be mended."""
     try:
         yield
     except TwofoldError as error:
@@ -240,7 +240,7 @@ def _without_objects(
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"], float]]:
     """Time, mask without held objects, hidden pixels and their share of the mask, of frames with objects.
 
-    Pictures are read several times, so that a long capture needs no memory for them.
+    Images are read several times, so that a long capture needs no memory for them.
     """
     shaped, focal = shape_body(body, torch.zeros(0)), float(camera.intrinsics[0, 0])
     size = (camera.height, camera.width)

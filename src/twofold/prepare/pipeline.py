@@ -1,4 +1,4 @@
-"""From raw clips to a capture folder: look at every picture, fit a body, judge the fit, write what is good."""
+"""From raw clips to a capture folder: look at every image, fit a body, judge the fit, write what is good."""
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -54,10 +54,10 @@ class Prepared:
 
     Attributes:
         folder: the capture.
-        kept: moments in the splits.
-        qualities: a record of every picture.
+        kept: frames in the splits.
+        qualities: a record of every image.
         warnings: sentences for the user.
-        objects: share of the mask that held objects took, of each picture that has some and is kept.
+        objects: share of the mask that held objects took, of each image that has some and is kept.
     """
 
     folder: Path
@@ -70,7 +70,7 @@ class Prepared:
         """What came of it in a few words."""
         moments = len({quality.time for quality in self.qualities})
         return (
-            f"{len(self.kept)} of {moments} moments, silhouette IoU {self.mean('iou'):.2f}, landmarks off by "
+            f"{len(self.kept)} of {moments} frames, silhouette IoU {self.mean('iou'):.2f}, landmarks off by "
             f"{self.mean('reprojection'):.1f} pixels ({self.mean('reprojection_percent'):.1f} % of the body's height)."
             f"{self._objects()}"
         )
@@ -81,13 +81,13 @@ class Prepared:
             return ""
         pictures = sum(quality.time in set(self.kept) for quality in self.qualities)
         return (
-            f" Held objects were taken out in {len(self.objects)} of {pictures} pictures, at most "
+            f" Held objects were taken out in {len(self.objects)} of {pictures} images, at most "
             f"{100 * max(self.objects):.1f} % and on average {100 * sum(self.objects) / max(pictures, 1):.1f} % of the "
             "person's mask; the report of check shows them, --held-objects keep leaves them."
         )
 
     def mean(self, what: Literal["iou", "reprojection", "reprojection_percent"]) -> float:
-        """Over the pictures of the moments that are kept."""
+        """Over the images of the frames that are kept."""
         kept = set(self.kept)
         return float(np.mean([getattr(q, what) for q in self.qualities if q.time in kept]))
 
@@ -103,10 +103,10 @@ def prepare(
     overwrite: bool = False,
     finder: Finder = people_finder,
 ) -> Prepared:
-    """Makes a capture folder from one clip, or from several of the same moments by calibrated cameras.
+    """Makes a capture folder from one clip, or from several synchronised ones by calibrated cameras.
 
     Args:
-        clips: videos or folders of pictures.
+        clips: videos or folders of images.
         out: the capture folder to make.
         body: to fit.
         estimator: makes a new estimator for each clip.
@@ -158,7 +158,7 @@ def require_one_person(people: People, clip: Path) -> None:
     """
     if people.too_many:
         raise TwofoldError(
-            f"{clip} shows several people of about the same size in {100 * people.several:.0f} % of its pictures, and "
+            f"{clip} shows several people of about the same size in {100 * people.several:.0f} % of its images, and "
             "which of them is meant nobody can tell; take --person largest, --person 1 (the leftmost in the first "
             "image, 2 the next), or your own --masks, or cut the clip to one person."
         )
@@ -185,7 +185,7 @@ def _watch_all(
                 seen = watch_clip(
                     clip.frames, clip.info.frames, found, scratch / clip.name, straighten,
                     [] if own.masks is None else own.masks.readings(),
-                    lambda done, k=k: show(0.3 * (k + done) / len(ready), "looking at the pictures"), region,
+                    lambda done, k=k: show(0.3 * (k + done) / len(ready), "looking at the images"), region,
                 )  # fmt: skip
         finally:
             found.close()
@@ -195,14 +195,14 @@ def _watch_all(
             remarks.append(sentence)
         remarks += [f"{clip.name}: {remark}" for remark in clip.frames.remarks]
         if seen.repeated:
-            remarks.append(f"{clip.name}: {seen.repeated} pictures equal the one before them and are left out.")
+            remarks.append(f"{clip.name}: {seen.repeated} images equal the one before them and are left out.")
         require_length(len(seen.images), str(clip.path))
         if config.landmarks is None:
             require_person(seen.track, str(clip.path))
         watched.append(seen)
     if len(watched) == 1:
         return watched, remarks
-    # Synchronised clips end a picture or two apart, and may lack one in between.
+    # Synchronised clips end an image or two apart, and may lack one in between.
     shared = set[int].intersection(*(set(seen.steps) for seen in watched))
     together = [seen.at([i for i, step in enumerate(seen.steps) if step in shared]) for seen in watched]
     require_length(len(shared), "What all videos show at the same time")
@@ -286,7 +286,7 @@ def _judge_all(found: _Found, body: Body, config: PrepareConfig, show: Show) -> 
 
 
 def _standing(motion: Motion, body: Body, camera: Camera) -> float:
-    """How tall the person would stand in the picture at its usual distance, pixels."""
+    """How tall the person would stand in the image at its usual distance, pixels."""
     vertices = pose_motion(body, motion).vertices
     height = float(vertices[:, 1].max() - vertices[:, 1].min())
     root = motion.translation @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]

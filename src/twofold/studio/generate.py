@@ -1,7 +1,7 @@
 """Studio captures: made people with known truth.
 
 A person is drawn from a seed (body, clothes, hair, face), moves in front of a ring of cameras under light that stays
-fixed, and is pictured exactly: the poses, the cameras and the surface of every test moment are the very ones used.
+fixed, and is pictured exactly: the poses, the cameras and the surface of every test frame are the very ones used.
 """
 
 import os
@@ -40,8 +40,8 @@ class StudioConfig:
 
     Attributes:
         seed: who, wearing what, moving how.
-        size: rows and columns of the pictures.
-        frames: moments; the last fifth shows the unseen motion.
+        size: rows and columns of the images.
+        frames: how many; the last fifth shows the unseen motion.
         cameras: in the ring; the first one trains.
         pose_noise: standard deviation of the error of the given poses, radians; a tenth of it in metres is that of the
             translations.
@@ -78,7 +78,7 @@ class StudioConfig:
 
 
 class Moment(NamedTuple):
-    """The person at one moment: the true posed surface and the light on it."""
+    """The person in one frame: the true posed surface and the light on it."""
 
     vertices: Float[np.ndarray, "V 3"]
     normals: Float[np.ndarray, "V 3"]
@@ -98,8 +98,8 @@ class Performer:
         figure: the dressed person in the canonical pose.
         folds: its wrinkles.
         beads: where light and shade are worked out.
-        poses: of all moments, radians.
-        translations: of all moments, metres; the soles touch the floor.
+        poses: of all frames, radians.
+        translations: of all frames, metres; the soles touch the floor.
     """
 
     body: Body
@@ -118,8 +118,8 @@ def cast(seed: int, rehearsed: int, unrehearsed: int) -> Performer:
 
     Args:
         seed: another seed, another person.
-        rehearsed: moments of the training motion.
-        unrehearsed: moments of the unseen motion.
+        rehearsed: frames of the training motion.
+        unrehearsed: frames of the unseen motion.
     """
     body = anny_body()
     random = np.random.default_rng([seed, 0])
@@ -142,7 +142,7 @@ def _posed(shaped: ShapedBody, pose: Float[np.ndarray, "24 3"], translation: Flo
 
 
 def perform(performer: Performer, time: int) -> Moment:
-    """The dressed person at one moment: wrinkled, posed and lit."""
+    """The dressed person in one frame: wrinkled, posed and lit."""
     figure, pose = performer.figure, performer.poses[time]
     moved = displacement(performer.folds, pose.astype(np.float64), len(figure.vertices)).astype(np.float32)
     canonical = figure.vertices + moved[:, None] * figure.normals
@@ -169,7 +169,7 @@ def photograph(
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """Colours over black and the share of each pixel that the person covers.
 
-    The mean over a pixel is taken of the sRGB values, as a program does that lays one picture over another.
+    The mean over a pixel is taken of the sRGB values, as a program does that lays one image over another.
     """
     figure = performer.figure
     hits = rasterize(
@@ -235,9 +235,9 @@ def make_studio(
 
 
 def plan_splits(frames: int, cameras: int) -> dict[str, dict[str, list[int]]]:
-    """Which camera shows which moments in which split.
+    """Which camera shows which frames in which split.
 
-    The first four fifths train from the first camera. Up to ten of them, evenly spread, and all later moments are
+    The first four fifths train from the first camera. Up to ten of them, evenly spread, and all later frames are
     shown by the other cameras (by the only one, where there is no other).
     """
     rehearsed = max(2, frames * 4 // 5)
@@ -272,7 +272,7 @@ def _film(
     writer: CaptureWriter,
     progress: Callable[[float], None],
 ) -> None:
-    """Every picture, mask and mesh, one moment after the other, several at once."""
+    """Every image, mask and mesh, one frame after the other, several at once."""
     rooms = (
         {name: room(camera, config.seed) for name, camera in cameras.items()} if config.background != "black" else {}
     )

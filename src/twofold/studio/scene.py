@@ -21,7 +21,7 @@ def ring(count: int, size: int, body: Float[np.ndarray, "n 3"]) -> dict[str, Cam
 
     Args:
         count: how many.
-        size: rows and columns of their pictures.
+        size: rows and columns of their images.
         body: points that must be seen, world, metres.
     """
     middle = 0.5 * float(body[:, 1].min() + body[:, 1].max())
@@ -45,7 +45,7 @@ def _toward(angle: float, middle: float) -> Float[torch.Tensor, "4 4"]:
 
 
 def room(camera: Camera, seed: int) -> Float[np.ndarray, "h w 3"]:
-    """What a camera sees of the empty studio: a board floor and a round wall with paper and pictures; sRGB, 0..1."""
+    """What a camera sees of the empty studio: a board floor and a round wall with paper and posters; sRGB, 0..1."""
     random = np.random.default_rng([seed, 4])
     fine = supersampled(camera, 2)
     rays = pixel_rays(fine, pixel_grid(fine))

@@ -1,6 +1,6 @@
 """The colours of a made person, painted anew for every sample from its place in the T-pose.
 
-Nothing is stored at vertices or in a picture, so stripes, seams and eyes stay sharp at any size.
+Nothing is stored at vertices or in an image, so stripes, seams and eyes stay sharp at any size.
 """
 
 from dataclasses import dataclass

@@ -112,7 +112,7 @@ def frame_order(config: TrainingConfig, seed: int, frames: int, step: int) -> li
 
 
 def epoch_steps(config: TrainingConfig, frames: int) -> int | float:
-    """Steps of an epoch: pictures over pictures per step, and as released the next whole number.
+    """Steps of an epoch: images over images per step, and as released the next whole number.
 
     >>> epoch_steps(TrainingConfig(images_per_step=2), 5), epoch_steps(TrainingConfig(epochs="steps"), 5)
     (2.5, 3)
@@ -364,7 +364,7 @@ def _agreed(
     named = dict(zip(terms, found, strict=True))
     if not math.isfinite(sum(found)):
         raise TwofoldError(
-            f"The loss at step {done - 1} is not a finite number; {LOWER_RATES}, or look at the capture's pictures and "
+            f"The loss at step {done - 1} is not a finite number; {LOWER_RATES}, or look at the capture's images and "
             "poses."
         )
     return Progress(done, steps, named, -10 * math.log10(max(error_mean, 1e-10))), stopping > 0

@@ -1,4 +1,4 @@
-"""Pixels for training: which rays of which picture a step looks at."""
+"""Pixels for training: which rays of which image a step looks at."""
 
 from dataclasses import dataclass
 
@@ -35,7 +35,7 @@ class _Picture:
 
 
 class PixelSource:
-    """Draws batches from frames; pictures are read once and kept as bytes."""
+    """Draws batches from frames; images are read once and kept as bytes."""
 
     def __init__(
         self, frames: tuple[Frame, ...], body: Body, betas: Float[Tensor, "S"], config: PixelConfig,
@@ -56,7 +56,7 @@ class PixelSource:
         self._pictures: dict[int, _Picture] = {}
 
     def picture(self, which: int) -> _Picture:
-        """The frame's picture and the pixels that may be drawn.
+        """The frame's image and the pixels that may be drawn.
 
         Raises:
             TwofoldError: its mask shows nobody, or nobody who is not ignored.
@@ -73,7 +73,7 @@ class PixelSource:
             limit = 127 if self.config.subject == "half" else 0
             raise TwofoldError(
                 f"{frame.mask_file} shows nobody: no pixel is brighter than {limit} of 255; make the mask again or "
-                "leave the picture out of the training frames."
+                "leave the image out of the training frames."
             )
         body = pose_body(self._shaped, frame.pose, frame.translation)
         near = self._near_body if self.config.reachable == "body" else self._in_box
@@ -92,7 +92,7 @@ class PixelSource:
         inside = inside & known
         if not inside.any():
             raise TwofoldError(
-                f"{frame.ignored_file} ignores all of the person; leave the picture out of the training frames."
+                f"{frame.ignored_file} ignores all of the person; leave the image out of the training frames."
             )
         subject &= reachable
         return _Picture(
@@ -166,7 +166,7 @@ class PixelSource:
         return torch.randperm(pool, generator=generator)[:count]
 
     def _window(self, picture: _Picture, reachable: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Flat pixels of one patch row by row, and which of them lie in the picture."""
+        """Flat pixels of one patch row by row, and which of them lie in the image."""
         size = self.config.patch_size
         height, width = picture.image.shape[:2]
         on_subject = bool(torch.rand((), generator=generator) < self.config.patch_on_subject)

@@ -158,7 +158,7 @@ def require_same(folder: Path, capture: Capture, motion: bool) -> None:
         folder: the run.
         capture: that it is to go on with, or to be drawn or measured with.
         motion: whether the training motion has to be the same, too. It has where corrections of poses are used, which
-            belong to moments; the avatar alone may take on any motion of its own body.
+            belong to frames; the avatar alone may take on any motion of its own body.
 
     Raises:
         TwofoldError: body, shape or, if asked for, motion differ.

@@ -1,4 +1,4 @@
-"""Calibrated cameras: matched to clips, brought to picture sizes, freed of distortion."""
+"""Calibrated cameras: matched to clips, brought to image sizes, freed of distortion."""
 
 from dataclasses import replace
 
@@ -76,17 +76,17 @@ def picture(height, width, bars=(0, 0), seed=0):
     return pixels
 
 
-def test_pictures_of_the_calibrated_size_change_nothing():
+def test_images_of_the_calibrated_size_change_nothing():
     assert for_pictures(camera(), picture(1280, 720)) is not None
     assert for_pictures(view := camera(), picture(1280, 720)) is view
 
 
 @given(st.sampled_from([(640, 360), (1920, 1080), (427, 240), (1279, 720)]))
-def test_scaled_pictures_show_the_same_in_another_size(size):
+def test_scaled_images_show_the_same_in_another_size(size):
     height, width = size
     view = for_pictures(camera(), picture(height, width))
     assert (view.height, view.width) == size
-    # Fractions of the picture stay, counted from its edge at -0.5.
+    # Fractions of the image stay, counted from its edge at -0.5.
     expected = (projected(camera(), POINTS) + 0.5) / [720, 1280] * [width, height] - 0.5
     assert np.abs(projected(view, POINTS) - expected).max() < 1e-9
 
@@ -101,7 +101,7 @@ def test_black_bars_are_seen():
     assert np.abs(projected(wide, POINTS) - expected).max() < 1e-9
 
 
-def test_dark_pictures_are_not_taken_for_bars():
+def test_dark_images_are_not_taken_for_bars():
     view = for_pictures(camera(), np.zeros((1280, 712, 3), np.uint8))
     assert np.array_equal(view.intrinsics, camera().intrinsics)
 
@@ -116,8 +116,8 @@ def test_what_coders_cut_off_lies_right_and_below():
 @pytest.mark.parametrize(
     ("size", "sentence"),
     [
-        ((720, 1280), "720x1280 pictures, its video has 1280x720; turn the video upright"),
-        ((1080, 1080), "720x1280 pictures, its video has 1080x1080; give the video as it was calibrated"),
+        ((720, 1280), "720x1280 images, its video has 1280x720; turn the video upright"),
+        ((1080, 1080), "720x1280 images, its video has 1080x1080; give the video as it was calibrated"),
         ((1280, 600), "its video has 600x1280; give the video"),
     ],
 )
@@ -189,7 +189,7 @@ def test_largest_distortion_is_in_a_corner():
     assert largest_distortion(camera(), 1280, 720) == 0
 
 
-def test_undistorted_pictures_are_what_a_perfect_lens_shows():
+def test_undistorted_images_are_what_a_perfect_lens_shows():
     view = replace(camera(distortion=LENS), height=256, width=144)
     view = replace(view, intrinsics=np.array([[200.0, 0, 71.5], [0, 200, 127.5], [0, 0, 1]]))
 

@@ -172,9 +172,9 @@ def spoilt(folder, kind, old, new):
         ("qualisys", "</cameras>", "", "is no valid XML"),
         ("qualisys", "<calibration>", '<!DOCTYPE a [<!ENTITY b "c">]><calibration>', "entities of its own"),
         ("qualisys", 'right="719"', 'right="nan"', "camera cam0: fov_video should give left, top, right, bottom"),
-        ("qualisys", 'bottom="1279"', 'bottom="1e8"', "camera cam0: its pictures have 720x100000001 pixels"),
+        ("qualisys", 'bottom="1279"', 'bottom="1e8"', "camera cam0: its images have 720x100000001 pixels"),
         ("qualisys", "<camera ", "<kamera ", "is no valid XML"),
-        ("qualisys", 'right="719"', 'right="-5"', "its pictures have -4x1280 pixels"),
+        ("qualisys", 'right="719"', 'right="-5"', "its images have -4x1280 pixels"),
         ("opencv/extri.yml", "T_cam1", "t_cam1", r"camera cam1: extri.yml should give T_cam1"),
         ("opencv/extri.yml", "_cam2: !!opencv", "_cam7: !!opencv", r"cam2: intri.yml should give K_cam2, extri.yml"),
         ("opencv/intri.yml", "K_cam0", "Q_cam0", r"camera cam0: intri.yml should give K_cam0"),
@@ -186,7 +186,7 @@ def spoilt(folder, kind, old, new):
         ("json", '"cameras"', '"kameras"', 'should hold "cameras" by name'),
         ("json", '"world_to_camera"', '"camera_to_world"', "camera cam0: world_to_camera should be 4 rows"),
         ("json", " 0.14,", ' "x",', "camera cam0: the distortion should be OpenCV's"),
-        ("json", '"height": 1280', '"height": 0', "camera cam0: its pictures have 720x0 pixels"),
+        ("json", '"height": 1280', '"height": 0', "camera cam0: its images have 720x0 pixels"),
     ],
 )  # fmt: skip
 def test_broken_calibrations_are_refused_in_one_sentence(tmp_path, kind, old, new, sentence):
@@ -250,4 +250,4 @@ def test_real_calibration_is_read():
         assert (view.height, view.width) == (1920, 1088)
         assert 1650 < view.intrinsics[0, 0] < 1700
         assert 1.5 < view.center[2] < 2.5, "hung as high as that above the floor"
-        assert view.world_to_camera[1, 2] < -0.8, "up in the world is up in the picture"
+        assert view.world_to_camera[1, 2] < -0.8, "up in the world is up in the image"

@@ -90,11 +90,11 @@ def test_landmarks_of_fewer_than_two_views_have_no_point():
     assert np.abs(found.points - points)[rest].max() < 1e-6
 
 
-def test_too_few_views_or_moments_are_refused():
+def test_too_few_views_or_frames_are_refused():
     track = seen(camera(), walker(SECONDS))
     with pytest.raises(TwofoldError, match="two views or more, there is 1"):
         triangulate([camera()], [track])
-    with pytest.raises(TwofoldError, match=r"different numbers of moments \(cam0 6, cam1 2\)"):
+    with pytest.raises(TwofoldError, match=r"different numbers of frames \(cam0 6, cam1 2\)"):
         triangulate(ring(2), [track, seen(camera(), walker(SECONDS[:2]))])
 
 

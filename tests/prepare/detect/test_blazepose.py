@@ -56,9 +56,9 @@ def picture(height=20, width=66):
     return np.zeros((height, width, 3), np.uint8)
 
 
-def test_shares_of_the_picture_become_pixels(pretended):
+def test_shares_of_the_image_become_pixels(pretended):
     found = mediapipe_estimator()(picture(), 0.0)
-    # The middle of a picture of 66 columns is between columns 32 and 33.
+    # The middle of an image of 66 columns is between columns 32 and 33.
     assert np.allclose(found.pixels[:, 0], np.arange(33) / 33 * 66 - 0.5, atol=1e-4)
     assert np.allclose(found.pixels[:, 1], (1 - np.arange(33) / 33) * 20 - 0.5, atol=1e-4)
     assert np.allclose(found.visibility, np.arange(33) / 32, atol=1e-5)
@@ -109,7 +109,7 @@ def test_masks_are_left_out_on_demand(pretended):
     assert pretended[0].closed == 1
 
 
-def test_nobody_in_a_blank_picture_and_not_a_word(capfd):
+def test_nobody_in_a_blank_image_and_not_a_word(capfd):
     pytest.importorskip("mediapipe")
     estimator = mediapipe_estimator()
     found = [estimator(np.full((120, 160, 3), 128, np.uint8), 0.1 * i) for i in range(2)]
@@ -130,7 +130,7 @@ def test_a_real_person(capfd):
     def at(name):
         return track.pixels[:, LANDMARKS.index(name)]
 
-    # He faces the camera, upright at first: his left is on the picture's right.
+    # He faces the camera, upright at first: his left is on the image's right.
     assert at("left_shoulder")[0, 0] > at("right_shoulder")[0, 0] + 20
     assert at("nose")[0, 1] < at("left_shoulder")[0, 1] < at("left_hip")[0, 1] < at("left_ankle")[0, 1]
     world = track.world[0]

@@ -18,7 +18,7 @@ def place_of(name: str) -> tuple[float, float]:
 
 
 def seen_in(layout: int, pictures: int = 6) -> np.ndarray:
-    """Landmarks in a layout; picture t is moved by t pixels to the right."""
+    """Landmarks in a layout; image t is moved by t pixels to the right."""
     values = np.full((pictures, layout, 3), 7.0)
     for index, name in enumerate(LAYOUTS[layout]):
         if name:
@@ -105,7 +105,7 @@ def test_null_in_json_is_missing(tmp_path):
     assert np.isnan(track.pixels[1, LANDMARKS.index("left_ear")]).all()
 
 
-def test_pictures_without_anybody_and_without_a_file(tmp_path):
+def test_images_without_anybody_and_without_a_file(tmp_path):
     values = seen_in(25)
     write_folder(tmp_path / "json", {0: [], 1: [values[1]], 3: [values[3]], 4: [values[4]], 5: [values[5]]})
     track = landmarks_from_file(tmp_path / "json", CLIP)
@@ -121,16 +121,16 @@ def test_of_several_people_the_largest_is_taken(tmp_path):
     check(landmarks_from_file(tmp_path / "json", CLIP), 25)
 
 
-def test_landmarks_shrink_with_the_pictures(tmp_path):
+def test_landmarks_shrink_with_the_images(tmp_path):
     np.savez(tmp_path / "l.npz", landmarks=seen_in(33))
     small = dataclasses.replace(CLIP, width=160, height=120)
     track = landmarks_from_file(tmp_path / "l.npz", small)
-    # The edges of the picture stay its edges: -0.5 is the left one, columns - 0.5 the right one.
+    # The edges of the image stay its edges: -0.5 is the left one, columns - 0.5 the right one.
     wanted = (np.array(place_of("nose")) + 0.5) / 4 - 0.5
     assert np.allclose(track.pixels[0, 0], wanted, atol=1e-4)
 
 
-def test_pictures_are_chosen(tmp_path):
+def test_images_are_chosen(tmp_path):
     np.savez(tmp_path / "l.npz", landmarks=seen_in(33))
     track = landmarks_from_file(tmp_path / "l.npz", CLIP)
     chosen = track_at(track, [0, 4, 6])
@@ -169,15 +169,15 @@ def folder_with(path, content):
         (lambda p: write(p, [{"image_id": i, "keypoints": [1, 2]} for i in range(6)]), "in turn"),
         (lambda p: p, "holds no JSON files"),
         (lambda p: folder_with(p, {"version": 1}), "pose_keypoints_2d"),
-        (lambda p: folder_with(p, {"people": []}), "nobody in any picture"),
+        (lambda p: folder_with(p, {"people": []}), "nobody in any image"),
         (lambda p: save(p, poses=np.zeros(3)), "lacks the array `landmarks`"),
         (lambda p: save(p, landmarks=np.zeros((6, 17, 2))), "6 x 17 x 2, expected"),
         (lambda p: save(p, landmarks=np.zeros((6, 21, 3))), "21 landmarks without names; known layouts have 17, 18"),
         (lambda p: save(p, landmarks=seen_in(17), names=["nose"]), "17 landmarks and 1 `names`"),
         (lambda p: save(p, landmarks=seen_in(17), names=list("abcdefghijklmnopq")), "lacks the landmark left_shoulder"),
-        (lambda p: save(p, landmarks=seen_in(17, 9)), "of 9 pictures, and the clip has 6"),
+        (lambda p: save(p, landmarks=seen_in(17, 9)), "of 9 images, and the clip has 6"),
         (lambda p: save(p, landmarks=seen_in(17) / [640, 480, 1]), "between 0 and 1"),
-        (lambda p: save(p, landmarks=seen_in(17) * [4, 4, 1]), "outside the pictures of 640 x 480"),
+        (lambda p: save(p, landmarks=seen_in(17) * [4, 4, 1]), "outside the images of 640 x 480"),
         (lambda p: save(p, landmarks=seen_in(17) * 0), "confidence above 0"),
     ],
 )

@@ -39,7 +39,7 @@ def rows(mask) -> int:
     ],
     ids=["from 0", "from 1", "from 1001", "same number in all", "no numbers"],
 )
-def test_masks_find_their_pictures(tmp_path, names):
+def test_masks_find_their_images(tmp_path, names):
     masks = masks_from_folder(write_masks(tmp_path, names), CLIP)
     assert [rows(masks(i)) for i in range(10)] == list(range(1, 11))
     assert masks(10) is None
@@ -71,7 +71,7 @@ def test_numbers_may_have_gaps(tmp_path, first):
     assert {i: rows(masks(i)) for i in range(10) if masks(i) is not None} == seen
 
 
-def test_names_of_a_folder_of_pictures_count(tmp_path):
+def test_names_of_a_folder_of_images_count(tmp_path):
     write_masks(tmp_path / "pictures", ["DSC7.png", "DSC12.png", "DSC30.png"])
     masks = masks_from_folder(
         write_masks(tmp_path / "masks", ["DSC30.png", "DSC7.png"]), describe(tmp_path / "pictures")
@@ -79,7 +79,7 @@ def test_names_of_a_folder_of_pictures_count(tmp_path):
     assert (rows(masks(0)), masks(1), rows(masks(2))) == (2, None, 1)
 
 
-def test_masks_follow_pictures_that_are_left_out_and_shrunk(tmp_path):
+def test_masks_follow_images_that_are_left_out_and_shrunk(tmp_path):
     clip = write_clip(tmp_path / "clip.mp4", [grey(5 * i, 96, 128) for i in range(20)], fps=20)
     frames = Frames(clip, fps=5, max_size=64)
     masks = masks_from_folder(write_masks(tmp_path / "masks", [f"{i}.png" for i in range(20)], 96, 128), frames.info)
@@ -129,7 +129,7 @@ def test_soft_edges_stay_soft(tmp_path):
     ("make", "sentence"),
     [
         (lambda p: p / "no", "does not exist"),
-        (lambda p: p, "holds no pictures"),
+        (lambda p: p, "holds no images"),
         (lambda p: write_masks(p, ["a.png"]) / "a.png", "is a file, expected a folder of masks"),
         (
             lambda p: write_masks(p, [f"{i}.png" for i in range(30)]),
@@ -149,9 +149,9 @@ def test_what_cannot_be_used_is_said_in_one_sentence(tmp_path, make, sentence):
 
 @pytest.mark.parametrize(
     ("pixels", "sentence"),
-    [(corners(), "is a coloured picture"), ("two objects", "marks 2 objects"), ("half", "is damaged")],
+    [(corners(), "is a coloured image"), ("two objects", "marks 2 objects"), ("half", "is damaged")],
 )
-def test_pictures_that_are_no_masks_are_named(tmp_path, pixels, sentence):
+def test_images_that_are_no_masks_are_named(tmp_path, pixels, sentence):
     path = tmp_path / "3.png"
     if isinstance(pixels, str):
         marks = Image.fromarray(np.random.default_rng(0).integers(0, 3, (48, 64), np.uint8)).convert("P")

@@ -31,7 +31,7 @@ def resized(image, rows):
 
 
 def beside(left, right, scale=1.0):
-    """Two pictures side by side, standing on the same floor; the second one made smaller."""
+    """Two images side by side, standing on the same floor; the second one made smaller."""
     small = resized(right, round(len(left) * scale))
     padded = np.pad(small, ((len(left) - len(small), 0), (0, 0), (0, 0)), constant_values=128)
     return np.concatenate([left, padded], 1)
@@ -69,7 +69,7 @@ def test_somebody_half_as_large_does_no_harm():
     assert not count_people(beside(a, b, 0.5) for a, b in pairs).too_many
 
 
-def test_nobody_is_in_empty_pictures(capfd):
+def test_nobody_is_in_empty_images(capfd):
     pytest.importorskip("mediapipe")
     rng = np.random.default_rng(0)
     people = count_people([np.zeros((90, 160, 3), np.uint8), rng.integers(0, 255, (300, 100, 3), np.uint8)])
@@ -98,7 +98,7 @@ def test_one_person_found_twice_is_one():
 
 
 @pytest.mark.parametrize(("height", "width"), [(448, 252), (448, 224), (448, 448), (448, 1600), (300, 301), (10, 3)])
-def test_windows_cover_the_picture_and_overlap(height, width):
+def test_windows_cover_the_image_and_overlap(height, width):
     found = windows(height, width)
     if width <= height // 2:
         assert found == []

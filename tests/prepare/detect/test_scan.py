@@ -65,8 +65,8 @@ def test_small_holes_are_filled_and_large_ones_stay():
     assert np.array_equal(clean, outer)
 
 
-def test_a_gap_at_the_picture_edge_is_no_hole_of_the_background():
-    """Everything else of the picture is one large piece, which must never be filled."""
+def test_a_gap_at_the_image_edge_is_no_hole_of_the_background():
+    """Everything else of the image is one large piece, which must never be filled."""
     mask = np.full((50, 50), 255, np.uint8)
     mask[0, 0] = 0
     assert (clean_mask(mask) == 255).all()
@@ -116,7 +116,7 @@ def wall(seed=0):
 
 
 def pictures(count, step=0, alive=None, every=1):
-    """A wall seen by a camera that moves sideways by `step` pixels a picture."""
+    """A wall seen by a camera that moves sideways by `step` pixels an image."""
     background = wall()
     for k in range(count):
         left = 20 + min(step * k, 20)
@@ -127,7 +127,7 @@ def pictures(count, step=0, alive=None, every=1):
         yield Picture(k, k / 10, image, every * k, k)
 
 
-def test_pictures_masks_and_landmarks_are_put_aside(tmp_path):
+def test_images_masks_and_landmarks_are_put_aside(tmp_path):
     finder, told = Finder(), []
     given = list(pictures(6, every=3))
     seen = watch_clip(iter(given), 6, finder, tmp_path / "a" / "b", show=told.append)
@@ -149,7 +149,7 @@ def test_pictures_masks_and_landmarks_are_put_aside(tmp_path):
     )
 
 
-def test_pictures_are_straightened_before_anybody_looks(tmp_path):
+def test_images_are_straightened_before_anybody_looks(tmp_path):
     finder = Finder()
     seen = watch_clip(pictures(3), 3, finder, tmp_path, straighten=lambda image: image // 2)
     plain = Finder()
@@ -176,7 +176,7 @@ def test_own_masks_are_taken_as_they_are(tmp_path):
         assert np.array_equal(np.asarray(picture), np.roll(own, 3, 1))
 
 
-def test_memory_holds_a_few_pictures_only(tmp_path):
+def test_memory_holds_a_few_images_only(tmp_path):
     alive, finder, most = [], Finder(), []
 
     def count(done):
@@ -184,7 +184,7 @@ def test_memory_holds_a_few_pictures_only(tmp_path):
 
     seen = watch_clip(pictures(60, alive=alive), 60, finder, tmp_path, show=count)
     assert len(seen.sample) == 12
-    # The sample, and the picture at hand with its mask.
+    # The sample, and the image at hand with its mask.
     assert max(most) <= 12 + 4
     assert sum(image() is not None for image in alive) == 12
     assert sum(mask() is not None for mask in finder.masks) <= 1

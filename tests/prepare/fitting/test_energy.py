@@ -145,7 +145,7 @@ def test_one_wild_landmark_costs_little(scene):
     assert float(wild) <= 1.2 * float(scene.seen.weight[0, 1, 15]) / MOMENTS + 1e-6
 
 
-def test_errors_count_by_the_size_of_the_person_in_the_picture(scene):
+def test_errors_count_by_the_size_of_the_person_in_the_image(scene):
     off = scene.off_by()
     double = {"pixels": 2 * scene.seen.pixels, "size": 2 * scene.seen.size}
     intrinsics = scene.seen.intrinsics.clone()
@@ -284,7 +284,7 @@ def test_the_outline_pulls_the_body_back(scene):
         assert ((off.translation.grad * aside).sum(-1) > 0).all()
 
 
-def test_moments_without_a_mask_are_left_alone(scene):
+def test_frames_without_a_mask_are_left_alone(scene):
     plain = the_body()
     masks = silhouettes(plain, acted(plain, MOMENTS), standing_camera(0.3))
     masks[2] = np.zeros_like(masks[2])

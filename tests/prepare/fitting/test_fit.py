@@ -50,13 +50,13 @@ def most(errors):
 
 
 def worst(errors):
-    """The largest error: no arm stays caught where it never was, at no moment."""
+    """The largest error: no arm stays caught where it never was, at no frame."""
     errors = np.asarray(errors)
     return float(errors[np.isfinite(errors)].max())
 
 
 def away(body, found, truth):
-    """How far each joint is off at each moment, metres."""
+    """How far each joint is off in each frame, metres."""
     return (joints_of(body, found) - joints_of(body, truth)).norm(dim=-1)
 
 
@@ -114,7 +114,7 @@ def test_one_camera_finds_what_it_can_see():
 def test_an_unknown_focal_length_goes_towards_the_truth(guess):
     """Somebody close by shows some perspective: too short a guess grows, too long a one shrinks.
 
-    Distance and focal length together change the picture little, so that not even thousands of steps get there, and
+    Distance and focal length together change the image little, so that not even thousands of steps get there, and
     what is usually believed of the guess holds it at once. Believed less, it goes a good part of the way.
     """
     body = the_body()
@@ -156,15 +156,15 @@ def test_the_number_of_threads_is_as_before(found):
     assert set(during) == ({1} if found else set())
 
 
-def test_nobody_in_any_picture_is_said_in_one_sentence():
+def test_nobody_in_any_image_is_said_in_one_sentence():
     body, (view,) = the_body(), cameras(0.0)
     empty = track_of([nobody(4, 4)] * 5)
-    with pytest.raises(TwofoldError, match=r"^Nobody was found in any picture; film one whole person"):
+    with pytest.raises(TwofoldError, match=r"^Nobody was found in any image; film one whole person"):
         fit(body, [Evidence(view, empty), Evidence(view, empty)], FPS)
 
 
 def unknown(track, times):
-    """Nobody found at some moments."""
+    """Nobody found in some frames."""
     parts = {name: value.copy() for name, value in vars(track).items()}
     parts["visibility"][times] = 0
     for name in ("pixels", "world"):
@@ -172,7 +172,7 @@ def unknown(track, times):
     return Track(**parts)
 
 
-def test_moments_that_show_nobody_are_bridged():
+def test_frames_that_show_nobody_are_bridged():
     body = the_body()
     truth, views = acted(body, 7), cameras(0.4, 2.1)
     evidence = []
@@ -189,7 +189,7 @@ def test_moments_that_show_nobody_are_bridged():
 
 
 def test_landmarks_in_space_without_masks_are_enough():
-    """Neither camera knows by itself how they lie in space, and one of them is unknown for a moment."""
+    """Neither camera knows by itself how they lie in space, and one of them is unknown for a frame."""
     body = the_body()
     # Turned well away from where a body without any guess would face.
     truth, views = acted(body, 4, heading=2.5), cameras(0.4, 2.1)
@@ -216,7 +216,7 @@ def test_the_same_evidence_gives_the_same_motion():
 
 @pytest.fixture
 def short_windows(monkeypatch):
-    """Windows of eight moments that share three, and a note of how much each traced and of what."""
+    """Windows of eight frames that share three, and a note of how much each traced and of what."""
     monkeypatch.setattr(fit_module, "WINDOW", 8)
     monkeypatch.setattr(fit_module, "OVERLAP", 3)
     traced = []

@@ -150,7 +150,7 @@ def test_whatever_is_unknown_the_guess_is_a_pose(seed, share):
     torch.testing.assert_close(found @ found.transpose(1, 2), torch.eye(3).expand(6, 3, 3), atol=1e-4, rtol=0)
 
 
-def test_a_moment_without_a_trunk_turns_as_the_nearest_one():
+def test_a_frame_without_a_trunk_turns_as_the_nearest_one():
     body = the_body()
     root, pose = limb_poses(6, 1)
     there = posed(body, root, pose)

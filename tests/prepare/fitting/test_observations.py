@@ -24,7 +24,7 @@ def scene():
 
 
 def blank(track, times=slice(None), **what):
-    """The track with some of its arrays unknown at some moments."""
+    """The track with some of its arrays unknown in some frames."""
     parts = {name: value.copy() for name, value in vars(track).items()}
     for name, value in what.items():
         parts[name][times] = value
@@ -115,7 +115,7 @@ def test_the_first_guess_is_near_where_the_person_is(scene, count):
 
 
 def test_of_several_guesses_the_one_that_knows_something_is_taken(scene):
-    """The camera that sees most has no landmarks in space at some moments, the other one has."""
+    """The camera that sees most has no landmarks in space in some frames, the other one has."""
     body, motion, cameras = scene
     motion = mean_body(motion)
     tracks = [landmarks(body, motion, camera) for camera in cameras]
@@ -127,7 +127,7 @@ def test_of_several_guesses_the_one_that_knows_something_is_taken(scene):
     torch.testing.assert_close(turns[0], turns[1], atol=1e-3, rtol=0)
 
 
-def test_moments_at_which_nobody_is_found_stand_where_the_nearest_others_do(scene):
+def test_frames_at_which_nobody_is_found_stand_where_the_nearest_others_do(scene):
     body, motion, cameras = scene
     track = blank(landmarks(body, motion, cameras[0]), slice(0, 2), pixels=np.nan, visibility=0.0, world=np.nan)
     started = begin(body, body_points(body), gather([Evidence(cameras[0], track)], [None], None))

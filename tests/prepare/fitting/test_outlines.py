@@ -46,7 +46,7 @@ def test_distances_are_those_to_the_nearest_pixel_of_the_person(seed):
     rows, columns = np.nonzero(mask > 127)
     low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()])
     rng = np.random.default_rng(seed)
-    # Within the surroundings, and not where distances fade at the picture's edge.
+    # Within the surroundings, and not where distances fade at the image's edge.
     reach, edge = 0.3 * (high - low).max(), 2 * float(outlines.cell[0])
     size = np.array([119, 89])
     places = rng.uniform(np.maximum(low - reach, edge), np.minimum(high + reach, size - edge), (200, 2))
@@ -101,7 +101,7 @@ def test_a_mask_without_a_person_is_known_as_such_and_all_numbers_are_finite(kin
 
 
 @pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
-def test_no_outline_where_the_picture_cuts_the_person_off(side):
+def test_no_outline_where_the_image_cuts_the_person_off(side):
     center = {"left": (5, 90), "right": (234, 90), "top": (120, 5), "bottom": (120, 174)}[side]
     outlines = trace_outlines([disc(center, 40)])
     edge = {"left": -0.5, "right": 239.5, "top": -0.5, "bottom": 179.5}[side]
@@ -110,17 +110,17 @@ def test_no_outline_where_the_picture_cuts_the_person_off(side):
     assert np.abs(points[:, axis] - edge).min() > float(outlines.cell[0])
     assert np.abs(np.linalg.norm(points - center, axis=1) - 40).max() < 1
     assert np.linalg.norm(outlines.normals[0].numpy(), axis=1).min() > 0.99
-    # Beyond the picture the person may go on, so nothing counts as outside there.
+    # Beyond the image the person may go on, so nothing counts as outside there.
     beyond = np.array(center, dtype=np.float32)
     beyond[axis] = edge + (-12 if side in ("left", "top") else 12)
     assert float(outlines.away(torch.from_numpy(beyond)[None, None])) == 0
-    # In the picture it does.
+    # In the image it does.
     inside = np.array(center, dtype=np.float32)
     inside[axis] += 55 if side in ("left", "top") else -55
     assert float(outlines.away(torch.from_numpy(inside)[None, None])) == pytest.approx(15, abs=1.5)
 
 
-def test_somebody_who_fills_the_picture_has_no_outline():
+def test_somebody_who_fills_the_image_has_no_outline():
     outlines = trace_outlines([np.full((40, 50), 255, np.uint8)])
     assert outlines.known.tolist() == [1]
     assert not outlines.normals.any()

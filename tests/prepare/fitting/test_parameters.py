@@ -1,4 +1,4 @@
-"""All moments at once are as one moment after the other; what a motion is told by does not matter to its pictures."""
+"""All frames at once are as one frame after the other; what a motion is told by does not matter to its images."""
 
 import math
 from dataclasses import replace
@@ -22,13 +22,13 @@ def in_double(name="sausages"):
 
 
 def one_by_one(body, motion):
-    """The posed body at each moment, by the plain functions for one pose."""
+    """The posed body in each frame, by the plain functions for one pose."""
     shaped = shape_body(body, motion.betas)
     return [pose_body(shaped, pose, shift) for pose, shift in zip(motion.full_pose(), motion.translation, strict=True)]
 
 
 @pytest.mark.parametrize("name", ["sausages", pytest.param("anny", marks=needs_anny)])
-def test_every_moment_is_the_body_in_that_pose(name):
+def test_every_frame_is_the_body_in_that_pose(name):
     body = in_double(name)
     motion = replace(random_motion(body, 3, 1, dtype=torch.float64), log_distance=torch.zeros((), dtype=torch.float64))
     posed = pose_motion(body, motion)
@@ -55,7 +55,7 @@ def test_landmarks_ride_on_their_joints(seed):
 
 
 @given(seed=seeds)
-def test_other_vertices_at_each_moment_are_placed_at_that_moment(seed):
+def test_other_vertices_at_each_frame_are_placed_at_that_frame(seed):
     body = in_double()
     posed = pose_motion(body, random_motion(body, 4, seed, dtype=torch.float64))
     everything = posed.place(choose(body, torch.arange(len(body.template))))

@@ -1,4 +1,4 @@
-"""The world is set upright, and nothing in any picture moves."""
+"""The world is set upright, and nothing in any image moves."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Which pictures are bad, which clips cannot work, and what a user is told."""
+"""Which images are bad, which clips cannot work, and what a user is told."""
 
 import json
 import math
@@ -35,13 +35,13 @@ GOOD = PictureQuality("cam", 0, 0.9, 1.0, 1.0, 0.9, False)
 
 
 def judged(iou=0.9, error=1.0, visibility=0.9, height=150.0, alone=True, **changes):
-    """The record of a picture whose landmarks are all `error` pixels off."""
+    """The record of an image whose landmarks are all `error` pixels off."""
     shown = np.random.default_rng(0).uniform(20, 140, (33, 2))
     arrays = {"pixels": shown + np.array([0.6, 0.8]) * error, "visibility": np.full(33, visibility)} | changes
     return picture_quality("cam", CAMERA, 7, iou, shown, height=height, alone=alone, **arrays)
 
 
-def test_a_good_picture_has_no_fault():
+def test_a_good_image_has_no_fault():
     quality = judged(error=3.0)
     assert quality == replace(quality, camera="cam", time=7, fault="", cropped=False)
     assert quality.reprojection == pytest.approx(3)
@@ -58,11 +58,11 @@ def test_a_good_picture_has_no_fault():
         ({"pixels": np.full((33, 2), np.nan)}, "nobody was found"),
     ],
 )
-def test_bad_pictures_say_why(changes, words):
+def test_bad_images_say_why(changes, words):
     assert words in judged(**changes).fault
 
 
-def test_at_the_thresholds_pictures_stay():
+def test_at_the_thresholds_images_stay():
     assert not judged(iou=LEAST_IOU).fault
     assert not judged(error=0.99 * MOST_REPROJECTION * 1.5).fault
     assert not judged(visibility=LEAST_VISIBILITY + 0.01).fault
@@ -94,7 +94,7 @@ def test_rows_can_be_stored_whatever_was_seen(pixels):
 
 @pytest.mark.parametrize("name", ["nose", "left_ankle", "right_wrist"])
 @pytest.mark.parametrize(("place", "cropped"), [((-3, 50), True), ((50, 203), True), ((-0.5, 199.5), False)])
-def test_ends_beyond_the_edge_make_a_picture_cropped(name, place, cropped):
+def test_ends_beyond_the_edge_make_an_image_cropped(name, place, cropped):
     pixels = np.full((33, 2), 50.0)
     pixels[LANDMARKS.index(name)] = place
     assert judged(pixels=pixels).cropped is cropped
@@ -105,7 +105,7 @@ def test_ends_beyond_the_edge_make_a_picture_cropped(name, place, cropped):
 
 def test_short_clips_are_refused():
     require_length(LEAST_PICTURES, "a.mp4")
-    with pytest.raises(TwofoldError, match=r"a.mp4 has 3 pictures, expected at least 12"):
+    with pytest.raises(TwofoldError, match=r"a.mp4 has 3 images, expected at least 12"):
         require_length(3, "a.mp4")
 
 
@@ -116,7 +116,7 @@ def track(found):
 
 def test_clips_without_a_person_are_refused():
     require_person(track([1] * 7 + [0] * 3), "a.mp4")
-    with pytest.raises(TwofoldError, match=r"a.mp4 shows a person in only 60 % of the pictures"):
+    with pytest.raises(TwofoldError, match=r"a.mp4 shows a person in only 60 % of the images"):
         require_person(track([1] * 6 + [0] * 4), "a.mp4")
     with pytest.raises(TwofoldError, match=r"a.mp4 shows nobody; film one whole person"):
         require_person(track([0] * 5), "a.mp4")
@@ -125,12 +125,12 @@ def test_clips_without_a_person_are_refused():
 def test_clips_that_cut_the_person_off_are_refused():
     half = [replace(GOOD, cropped=k % 2 == 0) for k in range(10)]
     require_whole(half, "a.mp4")
-    with pytest.raises(TwofoldError, match=r"In 55 % of the pictures of a.mp4 head, hands or feet"):
+    with pytest.raises(TwofoldError, match=r"In 55 % of the images of a.mp4 head, hands or feet"):
         require_whole([*half, replace(GOOD, cropped=True)], "a.mp4")
 
 
 def records(faults, moments=20, cameras=("a", "b")):
-    """Records of all pictures, with faults by (camera, time)."""
+    """Records of all images, with faults by (camera, time)."""
     return [
         replace(GOOD, camera=camera, time=time, fault=faults.get((camera, time), ""))
         for camera in cameras
@@ -138,13 +138,13 @@ def records(faults, moments=20, cameras=("a", "b")):
     ]
 
 
-def test_moments_that_any_camera_shows_badly_are_left_out():
+def test_frames_that_any_camera_shows_badly_are_left_out():
     faults = {("a", 3): "x", ("b", 3): "y", ("b", 7): "z"}
     assert kept_times(records(faults), "clip")[0] == [t for t in range(20) if t not in (3, 7)]
 
 
 @given(bad=st.integers(0, 20))
-def test_more_than_three_in_ten_bad_moments_are_too_many(bad):
+def test_more_than_three_in_ten_bad_frames_are_too_many(bad):
     faults = {("a", 19 - k): f"reason {19 - k}" for k in range(bad)}
     if bad <= 6:
         kept, left_out = kept_times(records(faults), "clip")
@@ -154,15 +154,15 @@ def test_more_than_three_in_ten_bad_moments_are_too_many(bad):
     with pytest.raises(TwofoldError) as error:
         kept_times(records(faults), "clip")
     span = f"{20 - bad}-19"
-    assert f"{bad} of 20 pictures of clip could not be understood (moments {span})" in str(error.value)
+    assert f"{bad} of 20 images of clip could not be understood (frames {span})" in str(error.value)
     assert f"at {20 - bad}, for one, reason {20 - bad}; film one person" in str(error.value)
 
 
-def test_dropped_moments_are_left_out_and_are_no_reason_to_refuse():
+def test_dropped_frames_are_left_out_and_are_no_reason_to_refuse():
     kept, left_out = kept_times(records({("a", 3): "reason 3"}), "clip", drop=range(5, 15))
     assert kept == [0, 1, 2, 4, *range(15, 20)]
     assert left_out == {3: "reason 3"} | dict.fromkeys(range(5, 15), "asked for with --drop")
-    with pytest.raises(TwofoldError, match="--drop leaves 2 pictures of clip"):
+    with pytest.raises(TwofoldError, match="--drop leaves 2 images of clip"):
         kept_times(records({}), "clip", drop=range(2, 20))
 
 
@@ -223,9 +223,9 @@ def test_leaning_is_no_turning():
         ({"moved": None}, []),
         (
             {"left_out": {3: "nobody was found", 4: "nobody was found", 9: "too dark (0.1)"}},
-            ["3 moments were left out: 3-4 (nobody was found); 9 (too dark)."],
+            ["3 frames were left out: 3-4 (nobody was found); 9 (too dark)."],
         ),
-        ({"yaw": 10.0, "moved": 30.0, "left_out": {0: "x"}}, ["only 10 degrees", "moves by up to 30", "1 moments"]),
+        ({"yaw": 10.0, "moved": 30.0, "left_out": {0: "x"}}, ["only 10 degrees", "moves by up to 30", "1 frames"]),
     ],
 )
 def test_warnings_say_what_to_know(changes, words):

@@ -14,7 +14,7 @@ from twofold.prepare.output.held_objects import (
 )
 from twofold.prepare.output.object_tracks import foreign_patches, without
 
-SCALE = 100.0  # pixels a metre: the pictures below are 2 m high
+SCALE = 100.0  # pixels a metre: the images below are 2 m high
 
 
 def _disc(row: float, column: float, radius: float) -> np.ndarray:
@@ -97,7 +97,7 @@ SHIRT, TROUSERS, STRIPE, BALL = (0.35, 0.4, 0.5), (0.1, 0.1, 0.2), (0.5, 0.3, 0.
 
 
 def _striped() -> tuple[np.ndarray, SeenBody, np.ndarray]:
-    """A picture of somebody in a striped shirt and dark trousers, the body in it, and its usual colours."""
+    """An image of somebody in a striped shirt and dark trousers, the body in it, and its usual colours."""
     body = _person()
     usual = np.zeros((200, 200, 3))
     usual[:100], usual[100:] = SHIRT, TROUSERS

@@ -1,4 +1,4 @@
-"""The fitted body held against pictures: how much it covers, how far landmarks are off, and what is no person."""
+"""The fitted body held against images: how much it covers, how far landmarks are off, and what is no person."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ SHIRT, WALL, BALL = (180, 60, 60), (90, 110, 130), (20, 230, 40)
 
 
 def filmed(folder, motion=None, balls=()):
-    """Pictures of somebody in one colour; at some moments a ball (column, row, radius) covers a part of them."""
+    """Images of somebody in one colour; in some frames a ball (column, row, radius) covers a part of them."""
     body = the_body()
     motion = motion or acted(body, MOMENTS)
     images, masks = [], []
@@ -81,7 +81,7 @@ def test_overlap_is_that_of_silhouette_and_mask(tmp_path):
     np.testing.assert_allclose([q.reprojection_percent for q in agreement.qualities], error / 1.5, rtol=1e-4)
 
 
-def test_bad_moments_are_found_and_only_these(tmp_path):
+def test_bad_frames_are_found_and_only_these(tmp_path):
     motion = acted(the_body(), MOMENTS)
     wrong = motion.translation.clone()
     wrong[3] += torch.tensor([0.5, 0.0, 0.0])
@@ -144,7 +144,7 @@ def test_held_objects_may_be_kept(tmp_path):
 
 
 def test_what_is_seen_once_or_keeps_to_the_body_stays(tmp_path):
-    """A patch of another colour on the shirt in every picture, and a ball in one."""
+    """A patch of another colour on the shirt in every image, and a ball in one."""
     column, row = hand(4)
     watched = filmed(tmp_path / "once", balls=[(4, (column + 12, row + 8, 13))])
     assert compared(watched).ignored == {}

@@ -28,7 +28,7 @@ PLAIN = PrepareConfig()
 
 
 def a_clip(folder, name="walk", width=240, height=160, count=3):
-    """A folder of grey pictures."""
+    """A folder of grey images."""
     (folder / name).mkdir(parents=True)
     for k in range(count):
         Image.fromarray(grey(90 + k, height, width)).save(folder / name / f"{k}.png")
@@ -36,7 +36,7 @@ def a_clip(folder, name="walk", width=240, height=160, count=3):
 
 
 def small_camera(name, azimuth=0.0, **options):
-    """One of the walker's cameras for pictures of 240 x 160."""
+    """One of the walker's cameras for images of 240 x 160."""
     return replace(
         camera(name, azimuth, **options), height=160, width=240,
         intrinsics=np.array([[200.0, 0, 119], [0, 210, 81], [0, 0, 1]]),
@@ -73,7 +73,7 @@ def test_a_camera_nobody_knows_is_guessed(tmp_path):
 
 @pytest.mark.parametrize("max_size", [960, 120, 100, 77])
 def test_given_intrinsics_are_those_of_the_clip_itself(tmp_path, max_size):
-    """Smaller pictures see the same: as `Camera.resized` has it, whole pixel areas."""
+    """Smaller images see the same: as `Camera.resized` has it, whole pixel areas."""
     config = replace(PLAIN, intrinsics=(300.0, 310.0, 100.0, 90.0), max_size=max_size)
     (clip,) = open_clips([a_clip(tmp_path)], config)
     full = Camera(torch.eye(4), torch.tensor([[300.0, 0, 100], [0, 310, 90], [0, 0, 1]]), 160, 240)
@@ -84,7 +84,7 @@ def test_given_intrinsics_are_those_of_the_clip_itself(tmp_path, max_size):
 
 @pytest.mark.parametrize("max_size", [960, 120, 100])
 @pytest.mark.parametrize("distortion", [(0, 0, 0, 0, 0), (-0.2, 0.05, 1e-3, -1e-3, 0)])
-def test_calibrated_cameras_see_the_same_in_smaller_pictures(tmp_path, max_size, distortion):
+def test_calibrated_cameras_see_the_same_in_smaller_images(tmp_path, max_size, distortion):
     lenses = [small_camera("left", 0.3, distortion=distortion), small_camera("right", 1.4, distortion=distortion)]
     clips = [a_clip(tmp_path, name) for name in ("right", "left")]
     config = replace(PLAIN, calibration=a_calibration(tmp_path, lenses), max_size=max_size)
@@ -101,7 +101,7 @@ def test_calibrated_cameras_see_the_same_in_smaller_pictures(tmp_path, max_size,
         if not any(distortion):
             assert clip.lens is None
             continue
-        # The lens is one for the smaller pictures, and undone it shows what the full one shows.
+        # The lens is one for the smaller images, and undone it shows what the full one shows.
         pixels = np.random.default_rng(1).uniform([0, 0], [239, 159], (20, 2))
         small = (pixels + 0.5) * scale - 0.5
         there = (undistort(lens, pixels) + 0.5) * scale - 0.5
@@ -144,7 +144,7 @@ def test_a_video_is_called_without_its_ending(tmp_path):
         (("a", "b"), {}, "2 videos were given, which need --calibration"),
         (("a",), {"intrinsics": (0.0, 1.0, 1.0, 1.0)}, "fx and fy above 0"),
         (("a",), {"intrinsics": (9.0, 9.0, 1.0, 1.0), "calibration": "c.json"}, "were both given"),
-        (("a",), {"held_out": 2}, "One moment of 2 cannot be held out"),
+        (("a",), {"held_out": 2}, "One frame of 2 cannot be held out"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(tmp_path, clips, changes, words):
@@ -190,7 +190,7 @@ def test_calibrations_of_other_clips_are_refused(tmp_path):
     config = replace(PLAIN, calibration=calibration)
     with pytest.raises(TwofoldError, match=r"cannot be told apart by the cameras of the calibration \(left, right\)"):
         open_clips([a_clip(tmp_path, name) for name in ("a", "b", "c")], config)
-    with pytest.raises(TwofoldError, match="was calibrated for 240x160 pictures, its video has 160x240"):
+    with pytest.raises(TwofoldError, match="was calibrated for 240x160 images, its video has 160x240"):
         open_clips([a_clip(tmp_path / "turned", "left", 160, 240), a_clip(tmp_path / "other", "right")], config)
     with pytest.raises(TwofoldError, match="is missing"):
         open_clips([a_clip(tmp_path, "left")], replace(PLAIN, calibration=tmp_path / "none.json"))

@@ -19,7 +19,7 @@ from twofold.prepare.video.frames import Frames, describe, natural_order, neares
 
 
 def levels(frames) -> list[int]:
-    """The grey of each picture."""
+    """The grey of each image."""
     return [round(float(picture.image.mean())) for picture in frames]
 
 
@@ -68,7 +68,7 @@ def test_pixels_come_out_square(tmp_path):
         assert {p.image.shape for p in frames} == {(*size[::-1], 3)}
 
 
-def test_every_picture_of_an_even_clip_comes_once(tmp_path):
+def test_every_image_of_an_even_clip_comes_once(tmp_path):
     shades = [10 * i for i in range(24)]
     path = write_clip(tmp_path / "clip.mp4", [grey(s) for s in shades], fps=24)
     frames = Frames(path)
@@ -81,7 +81,7 @@ def test_every_picture_of_an_even_clip_comes_once(tmp_path):
     assert levels(frames) == levels(found), "a second passage shows the same"
 
 
-def test_fewer_pictures_are_the_nearest_in_time(tmp_path):
+def test_fewer_images_are_the_nearest_in_time(tmp_path):
     path = write_clip(tmp_path / "clip.mp4", [grey(10 * i) for i in range(25)], fps=25)
     frames = Frames(path, fps=10)
     assert [p.source for p in frames] == [0, 2, 5, 7, 10, 12, 15, 17, 20, 22]
@@ -136,7 +136,7 @@ def test_the_rate_comes_from_the_time_stamps(tmp_path, monkeypatch):
     info = describe(path)
     assert info.fps == pytest.approx(20 / 3.0, rel=1e-3)
     assert "states 25 frames a second and its time stamps show 6.667" in info.remarks[0]
-    with pytest.raises(TwofoldError, match=r"7\.5 pictures a second were asked for, and vfr\.mkv has 6\.667"):
+    with pytest.raises(TwofoldError, match=r"7\.5 images a second were asked for, and vfr\.mkv has 6\.667"):
         describe(path, fps=7.5)
 
 
@@ -152,7 +152,7 @@ def test_every_item_comes_at_its_nearest_step_or_not_at_all(gaps, fps):
     assert all(item == when == seconds[number] for _, number, when, item in found)
 
 
-def test_a_clock_that_jumps_makes_no_pictures(tmp_path):
+def test_a_clock_that_jumps_makes_no_images(tmp_path):
     seconds = [0.0, 0.04, 0.08, 3600.0, 3600.04]
     frames = Frames(write_clip(tmp_path / "jump.mkv", [grey(40 * i) for i in range(5)], seconds=seconds), fps=25)
     assert [p.source for p in frames] == [0, 1, 2, 3, 4]
@@ -184,7 +184,7 @@ def test_a_folder_comes_in_natural_order(tmp_path):
     for number in (10, 2, 1):
         Image.fromarray(grey(20 * number)).save(tmp_path / f"frame{number}.png")
     (tmp_path / "._frame1.png").write_bytes(b"what other systems leave behind")
-    (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "notes.txt").write_text("no image")
     frames = Frames(tmp_path, fps=12)
     assert levels(frames) == [20, 40, 200]
     assert frames.info.names == ("frame1", "frame2", "frame10")
@@ -192,7 +192,7 @@ def test_a_folder_comes_in_natural_order(tmp_path):
     assert describe(tmp_path).fps == 30
 
 
-def test_pictures_of_a_folder_are_turned_and_brought_to_8_bits(tmp_path):
+def test_images_of_a_folder_are_turned_and_brought_to_8_bits(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6  # Shown after a quarter turn to the right
     (tmp_path / "turned").mkdir()
@@ -290,7 +290,7 @@ def test_damage_in_the_middle_is_left_out(tmp_path):
         (lambda p: text(p / "c.txt"), "cannot be read as a video"),
         (lambda p: write_sound(p / "c.m4a"), "only sound"),
         (lambda p: write_sound(p / "c.mp4"), "only sound"),
-        (lambda p: p, "holds no pictures"),
+        (lambda p: p, "holds no images"),
         (lambda p: sizes(p), "b.png is 65 x 48"),
         (lambda p: damaged(p), "b.png is no image of a known kind|b.png is damaged"),
     ],
@@ -344,7 +344,7 @@ def hang_up(server):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ({"fps": 60}, "60 pictures a second were asked for, and clip.mp4 has 25"),
+        ({"fps": 60}, "60 images a second were asked for, and clip.mp4 has 25"),
         ({"fps": 0}, "makes no sense"),
         ({"fps": float("nan")}, "makes no sense"),
         ({"max_size": 8}, "at least 64"),

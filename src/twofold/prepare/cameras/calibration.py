@@ -1,6 +1,6 @@
-"""Cameras that were calibrated before: matched to clips, brought to their picture size, freed of lens distortion.
+"""Cameras that were calibrated before: matched to clips, brought to their image size, freed of lens distortion.
 
-Pixels are counted as everywhere here: column i and row j of a picture is the point (i, j).
+Pixels are counted as everywhere here: column i and row j of an image is the point (i, j).
 """
 
 import re
@@ -15,10 +15,10 @@ from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
 
 _CROPPED = 16
-"""Video coders pad pictures to multiples of 16 pixels, and players cut that off again, right and below."""
+"""Video coders pad images to multiples of 16 pixels, and players cut that off again, right and below."""
 
 _SAME_SIZE = 1.15
-"""A principal point that is off the middle of the picture by less than this factor is that of its lens."""
+"""A principal point that is off the middle of the image by less than this factor is that of its lens."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class CalibratedCamera:
         intrinsics: [fx s cx; 0 fy cy; 0 0 1], pixels.
         distortion: OpenCV's k1, k2, p1, p2, k3.
         world_to_camera: rigid, metres; which way is up in the world is not known.
-        height: rows of the pictures it was calibrated for; None where the calibration does not say.
+        height: rows of the images it was calibrated for; None where the calibration does not say.
         width: columns of them.
     """
 
@@ -47,12 +47,12 @@ class CalibratedCamera:
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
     def without_distortion(self) -> "CalibratedCamera":
-        """The camera that took the undistorted pictures."""
+        """The camera that took the undistorted images."""
         return replace(self, distortion=np.zeros(5))
 
 
 def pinhole(camera: CalibratedCamera, height: int, width: int) -> Camera:
-    """The camera of undistorted pictures of this size, as captures have it."""
+    """The camera of undistorted images of this size, as captures have it."""
     matrices = [torch.as_tensor(m.astype(np.float32)) for m in (camera.world_to_camera, camera.intrinsics)]
     return Camera(matrices[0], matrices[1], height, width)
 
@@ -89,12 +89,12 @@ def match_cameras(cameras: Mapping[str, CalibratedCamera], clips: Sequence[str])
 
 
 def for_pictures(camera: CalibratedCamera, picture: UInt8[np.ndarray, "h w 3"]) -> CalibratedCamera:
-    """The camera of a clip whose pictures were cut or resized after the calibration.
+    """The camera of a clip whose images were cut or resized after the calibration.
 
     In this order: the same size; the same shape, so scaled; scaled with black bars on both sides, which must be seen
     in `picture`; a few columns or rows less or more, so cut or padded on the right or below, as video coders do; scaled
     and one side rounded to a multiple of 8 or 16, as video coders do too, so that both sides have their own scale.
-    Where the calibration does not say its size, the principal point must be near the middle of the picture.
+    Where the calibration does not say its size, the principal point must be near the middle of the image.
 
     Args:
         camera: as calibrated.
@@ -129,7 +129,7 @@ def for_pictures(camera: CalibratedCamera, picture: UInt8[np.ndarray, "h w 3"]) 
         return _resized(camera, height, width, (across, down), (0.0, 0.0))
     turned = abs(across * camera.width / camera.height - down * camera.height / camera.width) < 0.02
     raise TwofoldError(
-        f"Camera {camera.name} was calibrated for {camera.width}x{camera.height} pictures, its video has "
+        f"Camera {camera.name} was calibrated for {camera.width}x{camera.height} images, its video has "
         f"{width}x{height}; "
         + ("turn the video upright as it was calibrated." if turned else "give the video as it was calibrated.")
     )
@@ -188,7 +188,7 @@ def undistort(camera: CalibratedCamera, pixels: Float[np.ndarray, "*b 2"]) -> Fl
 
 
 def largest_distortion(camera: CalibratedCamera, height: int, width: int) -> float:
-    """How far the lens moves a point of a picture of this size at most, pixels."""
+    """How far the lens moves a point of an image of this size at most, pixels."""
     grid = _grid(np.linspace(0, height - 1, 33), np.linspace(0, width - 1, 33))
     return float(np.linalg.norm(distort(camera, grid) - grid, axis=-1).max())
 
@@ -196,9 +196,9 @@ def largest_distortion(camera: CalibratedCamera, height: int, width: int) -> flo
 def undistorter(
     camera: CalibratedCamera, height: int, width: int
 ) -> Callable[[UInt8[np.ndarray, "h w c"]], UInt8[np.ndarray, "h w c"]]:
-    """Turns pictures of this camera into what a perfect lens would have shown, of the same size.
+    """Turns images of this camera into what a perfect lens would have shown, of the same size.
 
-    What no pixel showed repeats the nearest one. The pictures belong to `camera.without_distortion()`.
+    What no pixel showed repeats the nearest one. The images belong to `camera.without_distortion()`.
     """
     source = distort(camera, _grid(np.arange(height), np.arange(width)))
     across, down = 2 * source[..., 0] / max(width - 1, 1) - 1, 2 * source[..., 1] / max(height - 1, 1) - 1
@@ -231,10 +231,10 @@ def _to_pixels(intrinsics: np.ndarray, plane: np.ndarray) -> np.ndarray:
 def _resized(
     camera: CalibratedCamera, height: int, width: int, scale: tuple[float, float], corner: tuple[float, float]
 ) -> CalibratedCamera:
-    """Pictures scaled and laid down with their left upper corner at `corner` (column, row) of larger ones."""
+    """Images scaled and laid down with their left upper corner at `corner` (column, row) of larger ones."""
     intrinsics = camera.intrinsics.copy()
     intrinsics[:2] *= np.array(scale)[:, None]
-    # The picture's edge lies half a pixel outside of its first pixel.
+    # The image's edge lies half a pixel outside of its first pixel.
     intrinsics[:2, 2] += np.array(corner) + 0.5 * (np.array(scale) - 1)
     return replace(camera, intrinsics=intrinsics, height=height, width=width)
 

@@ -83,7 +83,7 @@ def _camera(
         faults.append("the distortion should be OpenCV's k1, k2, p1, p2 and k3; undistort the videos first.")
     sides = [side for side in size if side is not None]
     if min(sides, default=1) < 1 or max(sides, default=1) > MAX_SIDE:
-        faults.append(f"its pictures have {width}x{height} pixels; give their size.")
+        faults.append(f"its images have {width}x{height} pixels; give their size.")
     if faults or k is None or given is None or rigid is None:
         raise TwofoldError(f"{where}: camera {name}: {faults[0]}")
     # Files round their numbers: the nearest rotation is meant.

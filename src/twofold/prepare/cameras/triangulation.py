@@ -35,13 +35,13 @@ _WORTH_IT = 0.8
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Points in space, one for each landmark at each moment.
+    """Points in space, one for each landmark in each frame.
 
     Attributes:
         points: the world's axes, metres; NaN where fewer than two views show the landmark.
-        residual: root mean square distance in the pictures over the views that agree, pixels; NaN likewise.
+        residual: root mean square distance in the images over the views that agree, pixels; NaN likewise.
         views: number of views that agree (within three times the usual error); 0 where there is no point.
-        errors: distance in each view's picture, pixels; NaN where it does not show the landmark.
+        errors: distance in each view's image, pixels; NaN where it does not show the landmark.
     """
 
     points: Float[np.ndarray, "t k 3"]
@@ -52,7 +52,7 @@ class Triangulation:
 
 @dataclass(frozen=True)
 class _Seen:
-    """All views of n points: where, how much it counts, and the usual error in each view's picture."""
+    """All views of n points: where, how much it counts, and the usual error in each view's image."""
 
     matrices: Float[np.ndarray, "v 3 4"]  # from the world to pixels
     rotations: Float[np.ndarray, "v 3 3"]
@@ -68,8 +68,8 @@ def triangulate(
 
     Args:
         cameras: one of each track.
-        tracks: the same moments in every view.
-        noise: the usual error of a landmark, pixels; by default a hundredth of the person's extent in each picture.
+        tracks: the same frames in every view.
+        noise: the usual error of a landmark, pixels; by default a hundredth of the person's extent in each image.
 
     Raises:
         TwofoldError: there are fewer than two views, or their lengths differ.
@@ -116,7 +116,7 @@ def turn_cameras(
 
     Args:
         cameras: one of each track.
-        tracks: the same moments in every view, left and right repaired.
+        tracks: the same frames in every view, left and right repaired.
         degrees: how far a touched camera is usually off.
 
     Raises:
@@ -168,7 +168,7 @@ def _gather(cameras: Sequence[CalibratedCamera], tracks: Sequence[Track], noise:
         raise TwofoldError(f"Points in space need two views or more, there is {len(tracks)}; give more videos.")
     if len(lengths) > 1:
         words = ", ".join(f"{c.name} {len(t)}" for c, t in zip(cameras, tracks, strict=True))
-        raise TwofoldError(f"The views have different numbers of moments ({words}); cut the videos to the same ones.")
+        raise TwofoldError(f"The views have different numbers of frames ({words}); cut the videos to the same ones.")
     rotations = np.stack([camera.world_to_camera[:3, :3] for camera in cameras])
     pixels = np.stack([undistort(c, t.pixels.reshape(-1, 2)) for c, t in zip(cameras, tracks, strict=True)])
     weights = np.stack([t.visibility.reshape(-1).astype(np.float64) for t in tracks])
@@ -179,7 +179,7 @@ def _gather(cameras: Sequence[CalibratedCamera], tracks: Sequence[Track], noise:
 
 
 def _extent(track: Track) -> float:
-    """How large the person usually is in the picture, pixels."""
+    """How large the person usually is in the image, pixels."""
     found = track.pixels[track.found]
     if not len(found):
         return 100.0
@@ -188,7 +188,7 @@ def _extent(track: Track) -> float:
 
 
 def _errors(seen: _Seen, points: np.ndarray) -> tuple[Float[np.ndarray, "v n"], Float[np.ndarray, "v n"]]:
-    """Distance in the pictures (pixels) and depth of points."""
+    """Distance in the images (pixels) and depth of points."""
     projected = np.einsum("vij,nj->vni", seen.matrices[:, :, :3], points) + seen.matrices[:, None, :, 3]
     depth = projected[..., 2]
     safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
@@ -234,7 +234,7 @@ def _between(a: np.ndarray, to_a: np.ndarray, b: np.ndarray, to_b: np.ndarray) -
 def _linearized(
     seen: _Seen, points: np.ndarray
 ) -> tuple[Float[np.ndarray, "v n 2"], Float[np.ndarray, "v n 2 3"], Float[np.ndarray, "v n"]]:
-    """Differences in the pictures in units of the usual error, their slopes with the points, and the weights."""
+    """Differences in the images in units of the usual error, their slopes with the points, and the weights."""
     projected = np.einsum("vij,nj->vni", seen.matrices[:, :, :3], points) + seen.matrices[:, None, :, 3]
     depth = np.where(np.abs(projected[..., 2]) < 1e-9, 1e-9, projected[..., 2])[..., None]
     flat = projected[..., :2] / depth

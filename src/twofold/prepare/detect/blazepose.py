@@ -11,9 +11,9 @@ from twofold.prepare.detections import Estimator, Observation, nobody
 
 
 def mediapipe_estimator(masks: bool = True) -> Estimator:
-    """BlazePose "full" (Bazarevsky et al. 2020), which follows the person from picture to picture.
+    """BlazePose "full" (Bazarevsky et al. 2020), which follows the person from image to image.
 
-    Times count: the landmarks are smoothed over a stretch of time, so that fewer pictures a second are smoothed less.
+    Times count: the landmarks are smoothed over a stretch of time, so that fewer images a second are smoothed less.
     World landmarks are its own guess, with a person of average size in mind.
 
     Args:
@@ -56,14 +56,14 @@ class _BlazePose:
             self._graph = self._mediapipe.solutions.pose.Pose(
                 static_image_mode=False, model_complexity=1, smooth_landmarks=True, enable_segmentation=self._masks
             )
-        # The package's own clock stands at 30 pictures a second and advances by that much in `process`.
+        # The package's own clock stands at 30 images a second and advances by that much in `process`.
         self._microseconds = max(self._microseconds + 1, 1_000_000 + round(1e6 * seconds))
         self._graph._simulated_timestamp = self._microseconds - 33_333
         return self._graph.process(np.ascontiguousarray(image))
 
 
 def _observation(found: Any, height: int, width: int) -> Observation:
-    """What MediaPipe found; its pictures reach from 0 to 1, from edge to edge and not from middle to middle."""
+    """What MediaPipe found; its images reach from 0 to 1, from edge to edge and not from middle to middle."""
     points, world = found.pose_landmarks.landmark, found.pose_world_landmarks.landmark
     mask = np.zeros((height, width), np.float32) if found.segmentation_mask is None else found.segmentation_mask
     return Observation(

@@ -1,4 +1,4 @@
-"""Landmarks that the user found: of any of the usual layouts, in one file or a file for each picture."""
+"""Landmarks that the user found: of any of the usual layouts, in one file or a file for each image."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,7 +35,7 @@ LAYOUTS = {
 """What landmarks are called, by how many there are: BlazePose, COCO, OpenPose's older 18 and BODY_25, HALPE_26 and
 COCO-WholeBody; those without a name are not used."""
 _MAX_BYTES = 256 * 2**20
-"""Of a JSON file: 133 landmarks in 30,000 pictures."""
+"""Of a JSON file: 133 landmarks in 30,000 images."""
 _MAX_NAME = 255
 _FARTHEST = 1e9
 """Pixels; what lies beyond was not found."""
@@ -48,21 +48,21 @@ def landmarks_from_file(path: Path | str, info: ClipInfo) -> Track:
 
 
 def landmark_readings(path: Path | str, info: ClipInfo) -> list[tuple[str, Track]]:
-    """Landmarks of every picture of a clip as it is before any are left out (`Picture.source`), scaled as they are.
+    """Landmarks of every image of a clip as it is before any are left out (`Picture.source`), scaled as they are.
 
-    World landmarks are NaN. What is missing is NaN with visibility 0; so are pictures without landmarks.
+    World landmarks are NaN. What is missing is NaN with visibility 0; so are images without landmarks.
 
     Args:
         path: one of
             * npz: `landmarks` (F x K x 3: column, row, confidence 0..1) and, unless the layout is known by K, `names`;
             * JSON: an object with the same two, null for what is missing;
             * JSON: a list of objects with `image_id` and `keypoints` (3 K numbers), as AlphaPose and COCO write it;
-            * a folder with a JSON file for each picture, as OpenPose and Pose2Sim write it.
-            Of several people in a picture the largest is taken.
+            * a folder with a JSON file for each image, as OpenPose and Pose2Sim write it.
+            Of several people in an image the largest is taken.
         info: the clip; columns and rows are those of its full size.
 
     Returns:
-        Each way in which they can belong to the pictures, in words, with the landmarks; the likeliest first.
+        Each way in which they can belong to the images, in words, with the landmarks; the likeliest first.
 
     Raises:
         TwofoldError: it is missing or damaged, of an unknown layout, lacks shoulders or hips, belongs to another clip
@@ -79,7 +79,7 @@ def landmark_readings(path: Path | str, info: ClipInfo) -> list[tuple[str, Track
     for words, values, names in found:
         if abs(len(values) - info.sources) > max(1, info.sources // 50):
             raise TwofoldError(
-                f"{path} has landmarks of {len(values)} pictures, and the clip has {info.sources}; give them for every "
+                f"{path} has landmarks of {len(values)} images, and the clip has {info.sources}; give them for every "
                 "one."
             )
         _check_place(values, info, path)
@@ -91,7 +91,7 @@ _Reading = tuple[str, Float[np.ndarray, "f k 3"], tuple[str, ...]]
 
 
 def _shifted(values: Float[np.ndarray, "f k 3"], names: tuple[str, ...], info: ClipInfo) -> list[_Reading]:
-    """Rows from the first picture on; where some are missing, they may be missing at the start."""
+    """Rows from the first image on; where some are missing, they may be missing at the start."""
     found: list[_Reading] = [("in order from the first image", values, names)]
     if 0 < (missing := info.sources - len(values)) <= max(1, info.sources // 50):
         nothing = np.full((missing, *values.shape[1:]), np.nan)
@@ -100,10 +100,10 @@ def _shifted(values: Float[np.ndarray, "f k 3"], names: tuple[str, ...], info: C
 
 
 def track_at(track: Track, sources: Sequence[int]) -> Track:
-    """The landmarks of some pictures, by their places; those beyond the end are not found.
+    """The landmarks of some images, by their places; those beyond the end are not found.
 
     Args:
-        track: of all pictures.
+        track: of all images.
         sources: `Picture.source` of those wanted.
     """
     places = np.array(sources, int)
@@ -119,13 +119,13 @@ def track_at(track: Track, sources: Sequence[int]) -> Track:
 def _from_arrays(arrays: dict[str, Any], path: Path) -> tuple[Float[np.ndarray, "f k 3"], tuple[str, ...]]:
     if "landmarks" not in arrays:
         raise TwofoldError(
-            f"{path} lacks the array `landmarks` (pictures x landmarks x 3); docs/prepare.md describes it."
+            f"{path} lacks the array `landmarks` (images x landmarks x 3); docs/prepare.md describes it."
         )
     values = _numbers(arrays["landmarks"])
     if values is None or values.ndim != 3 or values.shape[2] != 3 or 0 in values.shape:
         shape = "of unequal rows" if values is None else " x ".join(map(str, values.shape))
         raise TwofoldError(
-            f"{path}: `landmarks` is {shape}, expected pictures x landmarks x 3 (column, row, confidence)."
+            f"{path}: `landmarks` is {shape}, expected images x landmarks x 3 (column, row, confidence)."
         )
     if "names" not in arrays:
         return values, _layout(values.shape[1], path)
@@ -149,17 +149,17 @@ def _from_json(path: Path, info: ClipInfo) -> list[_Reading]:
     for entry in entries:
         name = str(entry["image_id"])
         if len(name) > _MAX_NAME:
-            raise TwofoldError(f"{path} names a picture {shown(name)}; write the landmarks anew.")
+            raise TwofoldError(f"{path} names an image {shown(name)}; write the landmarks anew.")
         people.setdefault(name, []).append(entry["keypoints"])
     names = {path / name: name for name in sorted(people, key=natural_order)}
     return [
         (n.words, *_assembled({place: people[names[file]] for place, file in n.places.items()}, info, path))
-        for n in numberings(list(names), info, "pictures with landmarks")
+        for n in numberings(list(names), info, "images with landmarks")
     ]
 
 
 def _from_folder(folder: Path, info: ClipInfo) -> list[_Reading]:
-    files = files_with(folder, (".json",), "JSON files; expected one with landmarks for each picture")
+    files = files_with(folder, (".json",), "JSON files; expected one with landmarks for each image")
     seen: dict[Path, list[Any]] = {}
     for file in files:
         content = read_json(file)
@@ -178,19 +178,19 @@ def _from_folder(folder: Path, info: ClipInfo) -> list[_Reading]:
 def _assembled(
     people: dict[int, list[Any]], info: ClipInfo, path: Path
 ) -> tuple[Float[np.ndarray, "f k 3"], tuple[str, ...]]:
-    """The largest person of each picture; NaN where nobody is."""
+    """The largest person of each image; NaN where nobody is."""
     chosen: dict[int, np.ndarray] = {}
     for place, candidates in people.items():
         for candidate in candidates:
             values = _numbers(candidate)
             if values is None or values.ndim != 1 or values.size == 0 or values.size % 3:
-                raise TwofoldError(f"{path}: the landmarks of picture {place} are not column, row, confidence in turn.")
+                raise TwofoldError(f"{path}: the landmarks of image {place} are not column, row, confidence in turn.")
             person = values.reshape(-1, 3)
             if place not in chosen or _extent(person) > _extent(chosen[place]):
                 chosen[place] = person
     counts = {len(person) for person in chosen.values()}
     if len(counts) != 1:
-        what = "nobody in any picture" if not counts else f"{min(counts)} landmarks here and {max(counts)} there"
+        what = "nobody in any image" if not counts else f"{min(counts)} landmarks here and {max(counts)} there"
         raise TwofoldError(f"{path} has {what}; find the landmarks again.")
     names = _layout(counts.pop(), path)
     values = np.full((max(*people, info.sources - 1, 0) + 1, len(names), 3), np.nan)
@@ -232,17 +232,17 @@ def _check_place(values: Float[np.ndarray, "f k 3"], info: ClipInfo, path: Path)
         raise TwofoldError(f"{path} holds no landmark with a confidence above 0; find the landmarks again.")
     if np.all(np.abs(seen) <= 2):
         raise TwofoldError(
-            f"{path} has columns and rows between 0 and 1; multiply them by the picture's width and height."
+            f"{path} has columns and rows between 0 and 1; multiply them by the image's width and height."
         )
     size = np.array([info.full_width, info.full_height])
     if np.mean(((seen >= -0.1 * size) & (seen <= 1.1 * size)).all(1)) < 0.5:
         raise TwofoldError(
-            f"Most landmarks in {path} lie outside the pictures of {size[0]} x {size[1]}; find them in these pictures."
+            f"Most landmarks in {path} lie outside the images of {size[0]} x {size[1]}; find them in these images."
         )
 
 
 def _track(values: Float[np.ndarray, "f k 3"], names: tuple[str, ...], info: ClipInfo) -> Track:
-    """In BlazePose's order, in pixels of the pictures that come."""
+    """In BlazePose's order, in pixels of the images that come."""
     ours = np.full((len(values), len(LANDMARKS), 3), np.nan)
     for place, name in enumerate(names):
         if name in LANDMARKS:

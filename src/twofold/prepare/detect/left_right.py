@@ -99,9 +99,9 @@ def repair_with_views(
     Each view in turn is held against the points that the others triangulate, until none changes any more.
 
     Args:
-        tracks: the same moments in every view.
+        tracks: the same frames in every view.
         cameras: one of each track.
-        seconds: when each moment was, rising.
+        seconds: when each frame was, rising.
 
     Raises:
         TwofoldError: see `triangulate`.
@@ -156,7 +156,7 @@ def _usual_length(vectors: np.ndarray) -> float:
 
 
 def _lines(track: Track, found: np.ndarray) -> tuple[Float[np.ndarray, "n p 3"], Float[np.ndarray, "n p"]]:
-    """From right to left twin, trunk lengths, in the picture and in depth where it is known; and how sure that is."""
+    """From right to left twin, trunk lengths, in the image and in depth where it is known; and how sure that is."""
     pixels, world = track.pixels[found].astype(np.float64), track.world[found].astype(np.float64)
     flat = (pixels[:, _LEFT] - pixels[:, _RIGHT]) / _usual_length(_trunk(pixels))
     deep = (world[:, _LEFT, 2:] - world[:, _RIGHT, 2:]) / _usual_length(_trunk(world))
@@ -190,7 +190,7 @@ def _continuity(
 def _alone(track: Track, found: np.ndarray, seconds: np.ndarray) -> Float[np.ndarray, "n"]:
     """Odds that each frame is as it was found, whatever the others are.
 
-    Cameras hang above people's feet, so toes that point to the camera lie lower in the picture than the heels.
+    Cameras hang above people's feet, so toes that point to the camera lie lower in the image than the heels.
     """
     pixels = track.pixels[found].astype(np.float64)
     at = {name: pixels[:, LANDMARKS.index(name)] for name in LANDMARKS}

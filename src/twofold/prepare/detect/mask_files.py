@@ -19,7 +19,7 @@ _OUTSIDE = 127
 
 @dataclass(frozen=True)
 class GivenMasks:
-    """Masks by picture of the clip.
+    """Masks by image of the clip.
 
     Attributes:
         folder: where they lie.
@@ -38,7 +38,7 @@ class GivenMasks:
     values: MaskValues
 
     def __call__(self, source: int) -> UInt8[np.ndarray, "h w"] | None:
-        """The mask of a picture, 0 outside .. 255 on the person; None where none was given.
+        """The mask of an image, 0 outside .. 255 on the person; None where none was given.
 
         Raises:
             TwofoldError: it cannot be read.
@@ -56,11 +56,11 @@ class GivenMasks:
 
 
 def masks_from_folder(folder: Path | str, info: ClipInfo) -> GivenMasks:
-    """Finds out which mask belongs to which picture (see `numberings`) and what their values mean (`mask_values`).
+    """Finds out which mask belongs to which image (see `numberings`) and what their values mean (`mask_values`).
 
     Args:
-        folder: of PNG or JPEG files as large as the clip's pictures, before or after these are made smaller. White or
-            one is the person, black or zero the rest; of cut-out pictures the opacity counts.
+        folder: of PNG or JPEG files as large as the clip's images, before or after these are made smaller. White or
+            one is the person, black or zero the rest; of cut-out images the opacity counts.
         info: the clip.
 
     Raises:
@@ -76,7 +76,7 @@ def masks_from_folder(folder: Path | str, info: ClipInfo) -> GivenMasks:
     _require_sizes(files, info)
     if 2 * len(files) < info.sources:
         raise TwofoldError(
-            f"{folder} holds {len(files)} masks, and the clip has {info.sources} pictures; at least half need one."
+            f"{folder} holds {len(files)} masks, and the clip has {info.sources} images; at least half need one."
         )
     return GivenMasks(folder, found[0], tuple(found[1:]), info.width, info.height, mask_values(files))
 
@@ -87,6 +87,6 @@ def _require_sizes(files: Sequence[Path], info: ClipInfo) -> None:
         if (size := picture_size(path)) not in sizes:
             aside = size[::-1] in sizes
             raise TwofoldError(
-                f"{path} has {size[0]} x {size[1]} pixels, and the clip's pictures have {sizes[0][0]} x {sizes[0][1]}; "
-                + ("turn the masks upright, as the pictures are." if aside else "make the masks from these pictures.")
+                f"{path} has {size[0]} x {size[1]} pixels, and the clip's images have {sizes[0][0]} x {sizes[0][1]}; "
+                + ("turn the masks upright, as the images are." if aside else "make the masks from these images.")
             )

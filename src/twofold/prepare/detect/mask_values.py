@@ -82,9 +82,7 @@ def mask_values(files: Sequence[Path]) -> MaskValues:
     grey = [f for f in found if not (opacity and f.transparent is not None)]
     colored = next((path for path, f in zip(files, found, strict=True) if f in grey and f.colored), None)
     if colored is not None:
-        raise TwofoldError(
-            f"{colored} is a coloured picture; expected a mask, white on the person and black elsewhere."
-        )
+        raise TwofoldError(f"{colored} is a coloured image; expected a mask, white on the person and black elsewhere.")
     objects = frozenset[tuple[int, ...]]().union(*(f.objects for f in found))
     if len(objects) > 1:
         raise TwofoldError(f"{where} marks {len(objects)} objects; keep the person alone, in white.")

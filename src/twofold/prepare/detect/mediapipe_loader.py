@@ -22,7 +22,7 @@ def load_mediapipe() -> ModuleType:
         with quiet():
             module = importlib.import_module("mediapipe")
     except ImportError as error:
-        raise TwofoldError(f"Finding people in pictures needs MediaPipe 0.10.21; {_ADVICE}.") from error
+        raise TwofoldError(f"Finding people in images needs MediaPipe 0.10.21; {_ADVICE}.") from error
     if not hasattr(module, "solutions"):
         version = getattr(module, "__version__", "of an unknown version")
         raise TwofoldError(f"MediaPipe {version} comes without models, 0.10.21 is needed; {_ADVICE}.")

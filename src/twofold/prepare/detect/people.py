@@ -15,7 +15,7 @@ from twofold.prepare.detect.mediapipe_loader import load_mediapipe, quiet
 COMPARABLE = 0.6
 """Whoever is this large beside the largest person counts."""
 SHARE = 0.3
-"""Several people are in view if they are found in this share of the pictures."""
+"""Several people are in view if they are found in this share of the images."""
 
 _HEIGHT = 448  # Rows that are looked at; the detector itself sees 224.
 _APART = 0.35  # Two findings whose hips or shoulders are nearer than this, in sizes, are one person.
@@ -29,7 +29,7 @@ node { calculator: "PoseDetectionCpu" input_stream: "IMAGE:image" output_stream:
 
 @dataclass(frozen=True)
 class Person:
-    """Somebody found in a picture, in its pixels.
+    """Somebody found in an image, in its pixels.
 
     Attributes:
         hips: column and row of their middle.
@@ -46,27 +46,27 @@ class Person:
 
 @dataclass(frozen=True)
 class People:
-    """Who is in view in pictures from all through a clip.
+    """Who is in view in images from all through a clip.
 
     Attributes:
-        counts: in each picture, the largest person and those at least 0.6 times as large.
+        counts: in each image, the largest person and those at least 0.6 times as large.
     """
 
     counts: tuple[int, ...]
 
     @property
     def nobody(self) -> float:
-        """Share of the pictures in which nobody was found."""
+        """Share of the images in which nobody was found."""
         return sum(count == 0 for count in self.counts) / max(len(self.counts), 1)
 
     @property
     def several(self) -> float:
-        """Share of the pictures in which more than one person was found."""
+        """Share of the images in which more than one person was found."""
         return sum(count > 1 for count in self.counts) / max(len(self.counts), 1)
 
     @property
     def too_many(self) -> bool:
-        """Several people in 0.3 of the pictures: which of them is meant, nobody can tell."""
+        """Several people in 0.3 of the images: which of them is meant, nobody can tell."""
         return self.several >= SHARE
 
 
@@ -74,10 +74,10 @@ def count_people(images: Iterable[UInt8[np.ndarray, "_ _ 3"]]) -> People:
     """Who is in view, by MediaPipe's person detector.
 
     A second person counts who is at least 0.6 times as large as the first, so that passers-by behind do not. Every
-    picture is looked at whole and through windows half as wide as high, as the detector misses small people.
+    image is looked at whole and through windows half as wide as high, as the detector misses small people.
 
     Args:
-        images: some 10 to 20 pictures from all through a clip, 8-bit sRGB.
+        images: some 10 to 20 images from all through a clip, 8-bit sRGB.
 
     Raises:
         TwofoldError: MediaPipe is not installed.
@@ -96,7 +96,7 @@ def people_finder() -> Generator[Callable[[UInt8[np.ndarray, "_ _ 3"]], list[Per
     load_mediapipe()
     solutions: Any = importlib.import_module("mediapipe.python.solution_base")
     kinds = {"people": solutions.PacketDataType.PROTO_LIST}
-    with quiet():  # It speaks at the start and at the first picture.
+    with quiet():  # It speaks at the start and at the first image.
         detector = solutions.SolutionBase(graph_config=_DETECTOR, outputs=["people"], stream_type_hints=kinds)
         detector.process(np.zeros((_HEIGHT, _HEIGHT, 3), np.uint8))
     try:
@@ -106,7 +106,7 @@ def people_finder() -> Generator[Callable[[UInt8[np.ndarray, "_ _ 3"]], list[Per
 
 
 def find_people(image: UInt8[np.ndarray, "h w 3"], detector: Any) -> list[Person]:
-    """Everybody the detector finds in a picture, the surest first, nobody twice."""
+    """Everybody the detector finds in an image, the surest first, nobody twice."""
     height, width = image.shape[:2]
     scale = min(_HEIGHT / height, 1.0)
     small = Image.fromarray(image).resize((max(round(width * scale), 1), round(height * scale)), Image.Resampling.BOX)

@@ -1,6 +1,6 @@
-"""One camera's clip gone through once: pictures and masks put aside as files, landmarks kept.
+"""One camera's clip gone through once: images and masks put aside as files, landmarks kept.
 
-Memory does not grow with the clip's length but for the landmarks, a few hundred bytes a picture.
+Memory does not grow with the clip's length but for the landmarks, a few hundred bytes an image.
 """
 
 import io
@@ -22,10 +22,10 @@ from twofold.prepare.silhouettes import overlap
 from twofold.prepare.video.frames import Picture
 
 _SAMPLES, _VIEWS = 12, 40
-"""Pictures that are kept to count people, and backgrounds that are compared."""
+"""Images that are kept to count people, and backgrounds that are compared."""
 
 _QUALITY = 95
-"""Of the stored pictures; video has lost more already."""
+"""Of the stored images; video has lost more already."""
 
 Straighten = Callable[[UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "h w 3"]]
 Own = Callable[[int], UInt8[np.ndarray, "h w"] | None]
@@ -36,15 +36,15 @@ class Watched:
     """What was seen in a clip.
 
     Attributes:
-        images: files of the pictures.
+        images: files of the images.
         masks: files of the masks, 0 outside .. 255 on the person.
         track: landmarks.
-        sources: which picture of the clip itself each one is; none comes twice.
+        sources: which image of the clip itself each one is; none comes twice.
         seconds: when each was taken.
         steps: the even step of time that each stands for (`Picture.step`).
         moved: how far the background moves at most, pixels; None where that cannot be told.
-        sample: some pictures spread over the clip.
-        repeated: pictures that show the same as the one before, and are left out.
+        sample: some images spread over the clip.
+        repeated: images that show the same as the one before, and are left out.
         overlaps: of each reading of the user's own masks the IoU with the estimator's, NaN where one is missing; empty
             unless there are several readings.
     """
@@ -61,7 +61,7 @@ class Watched:
     overlaps: tuple[tuple[float, ...], ...] = ()
 
     def at(self, places: Sequence[int]) -> "Watched":
-        """Only some of the pictures, by their places."""
+        """Only some of the images, by their places."""
         chosen = list(places)
         track = replace(self.track, **{name: value[chosen] for name, value in vars(self.track).items()})
         names = ("images", "masks", "sources", "seconds", "steps")
@@ -78,22 +78,22 @@ def watch_clip(
     show: Callable[[float], None] | None = None,
     region: Callable[[UInt8[np.ndarray, "h w 3"], int], Region | None] | None = None,
 ) -> Watched:
-    """Looks at every picture of a clip. One that equals the one before it, as stretched videos have them, is left out.
+    """Looks at every image of a clip. One that equals the one before it, as stretched videos have them, is left out.
 
     Args:
         pictures: in order.
         expected: about how many there are.
         estimator: finds the person.
         scratch: folder for the files.
-        straighten: takes the lens's distortion out of a picture.
-        given: the user's own mask of a picture by its `source`, None where there is none; taken as it is. Where several
+        straighten: takes the lens's distortion out of an image.
+        given: the user's own mask of an image by its `source`, None where there is none; taken as it is. Where several
             readings are given the estimator's masks are kept, to choose by (`with_masks`).
         show: told the share that is done.
-        region: where the person is in a straightened picture with its `source`, None for anywhere. By default around
-            the user's own mask; where a picture has none, around the last one.
+        region: where the person is in a straightened image with its `source`, None for anywhere. By default around
+            the user's own mask; where an image has none, around the last one.
 
     Raises:
-        TwofoldError: a picture cannot be read, or the disk refuses.
+        TwofoldError: an image cannot be read, or the disk refuses.
     """
     images: list[Path] = []
     masks: list[Path] = []
@@ -141,7 +141,7 @@ def watch_clip(
         if show is not None:
             show(min(1.0, (picture.index + 1) / max(expected, 1)))
     if not images:
-        raise TwofoldError("A clip without any picture cannot be prepared; choose another.")
+        raise TwofoldError("A clip without any image cannot be prepared; choose another.")
     places, seconds, steps = zip(*sources, strict=True)
     return Watched(
         tuple(images), tuple(masks), track_of(seen), places, seconds, steps, background_motion(views).moved,
@@ -166,7 +166,7 @@ def _straight(mask: UInt8[np.ndarray, "h w"] | None, straighten: Straighten | No
 
 
 def save_picture(path: Path, pixels: UInt8[np.ndarray, "h w *c"], **options: int) -> None:
-    """Writes a picture file; unlike Pillow's own writing it notices a disk that takes only a part."""
+    """Writes an image file; unlike Pillow's own writing it notices a disk that takes only a part."""
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, Image.registered_extensions()[path.suffix], **options)
     path.write_bytes(buffer.getvalue())

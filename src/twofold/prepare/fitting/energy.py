@@ -23,7 +23,7 @@ STIFFNESS = {
 
 @dataclass(frozen=True)
 class PriorWeights:
-    """What is known about people before any picture.
+    """What is known about people before any image.
 
     Attributes:
         joint_acceleration: what people's joints reach in quick motion, metres per second squared.
@@ -61,7 +61,7 @@ def _robust(squared: Tensor) -> Tensor:
 
 
 def landmark_term(posed: Posed, points: BodyPoints, motion: Motion, seen: Seen, error: float) -> Tensor:
-    """Landmarks beside where they are seen; `error` in percent of the person's height in the picture."""
+    """Landmarks beside where they are seen; `error` in percent of the person's height in the image."""
     places = place_points(posed, points, motion)
     loss = places.new_zeros(())
     for k in range(len(seen.pixels)):
@@ -108,7 +108,7 @@ def prior(body: Body, posed: Posed, motion: Motion, fps: float, weights: PriorWe
         change = (joints[2:] - 2 * joints[1:-1] + joints[:-2]) * (fps**2 / weights.joint_acceleration * 1.7 / height)
         turns = torch.cat([motion.root[:, None], motion.pose], 1)
         turning = (turns[2:] - 2 * turns[1:-1] + turns[:-2]) * (fps**2 / weights.turn_acceleration)
-        # The motion's own smoothness is one piece of evidence per second, each picture one per moment.
+        # The motion's own smoothness is one piece of evidence per second, each image one per frame.
         weight = weights.smoothness / fps
         loss = loss + weight * (_gentle(change) + _gentle(turning))
     loss = loss + weights.shape * motion.betas.square().sum()

@@ -1,6 +1,6 @@
 """Fits a body to the landmarks and masks of a whole clip, seen by one camera or by several.
 
-All moments are fitted together, in three stages: the landmarks' directions in space give a first guess; then the body's
+All frames are fitted together, in three stages: the landmarks' directions in space give a first guess; then the body's
 points are moved to where the landmarks are seen; then its outline is moved to the outline of the mask. People move
 smoothly, bend their joints one way only, and have one shape.
 """
@@ -25,12 +25,12 @@ from twofold.prepare.fitting.parameters import Chosen, Motion, Posed, choose, po
 WARM_UP = 20
 """Steps over which the rate grows to its full size."""
 WINDOW, OVERLAP = 240, 24
-"""Moments fitted together, and how many of them two neighbours share."""
+"""Frames fitted together, and how many of them two neighbours share."""
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How hard each kind of evidence pulls. Lengths in the picture count in percent of the person's height there.
+    """How hard each kind of evidence pulls. Lengths in the image count in percent of the person's height there.
 
     Attributes:
         steps: of the landmark stage and of the outline stage.
@@ -74,15 +74,15 @@ def fit(
 
     Args:
         body: of any kind; the shape coefficients that it has are fitted.
-        evidence: of each camera, all of the same moments.
-        fps: moments per second.
+        evidence: of each camera, all of the same frames.
+        fps: frames per second.
         free_focal: the focal length of the one camera is a guess and is fitted too.
         config: weights.
         points_in_space: landmarks triangulated from several cameras, world, metres; NaN where unknown.
         watch: told the share that is done.
 
     Raises:
-        TwofoldError: nobody was found at any moment.
+        TwofoldError: nobody was found in any frame.
     """
     threads = torch.get_num_threads()
     # Thousands of small operations: sharing them out costs more than it saves.
@@ -106,7 +106,7 @@ def _fit(
 ) -> Motion:
     moments = len(evidence[0].track)
     if not np.any([e.track.found for e in evidence]):
-        raise TwofoldError("Nobody was found in any picture; film one whole person, well lit, and try again.")
+        raise TwofoldError("Nobody was found in any image; film one whole person, well lit, and try again.")
     if moments <= WINDOW + OVERLAP:
         return _fit_window(body, evidence, fps, free_focal, config, points_in_space, None, watch)
     starts = list(range(0, moments - OVERLAP, WINDOW))
@@ -187,7 +187,7 @@ def _fit_window(
 
         return loss
 
-    # Directions in space first, so that no limb starts from the wrong side of the picture plane.
+    # Directions in space first, so that no limb starts from the wrong side of the image plane.
     few = config.steps[0] // 3
     motion = _descend(body, motion, ("root", "pose", "translation"), everything(1.0, 4.0), few, config.rate)
     watch(few / total)

@@ -40,11 +40,11 @@ def register(
 def first_pose(
     points: BodyPoints, landmarks: Float[Tensor, "t 33 3"]
 ) -> tuple[Float[Tensor, "t 3 3"], Float[Tensor, "t 23 3"], Bool[Tensor, "t"]]:
-    """Root rotations, poses of the other joints (axis-angle), and for which moments there was anything to go by.
+    """Root rotations, poses of the other joints (axis-angle), and for which frames there was anything to go by.
 
     Args:
         points: of the body.
-        landmarks: in the world, metres about any centre; NaN where unknown. A moment without a trunk takes the
+        landmarks: in the world, metres about any centre; NaN where unknown. A frame without a trunk takes the
             rotation of the nearest one that has it; a limb without landmarks hangs as in the T-pose.
     """
     chosen = [LANDMARKS.index(name) for name in _TRUNK]

@@ -24,7 +24,7 @@ class Evidence:
     Attributes:
         camera: with a guess of the focal length where that is unknown.
         track: landmarks, sides repaired.
-        masks: of each moment, as arrays (0..255) or as picture files, which keeps the memory of long clips small;
+        masks: of each frame, as arrays (0..255) or as image files, which keeps the memory of long clips small;
             None where there are none.
     """
 
@@ -39,7 +39,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Seen:
-    """Evidence of all cameras as tensors, c cameras and t moments; landmarks in space are each camera's or common."""
+    """Evidence of all cameras as tensors, c cameras and t frames; landmarks in space are each camera's or common."""
 
     world_to_camera: Float[Tensor, "c 4 4"]
     intrinsics: Float[Tensor, "c 3 3"]
@@ -94,7 +94,7 @@ def begin(body: Body, points: BodyPoints, seen: Seen) -> Motion:
     """A first guess: the mean shape, posed by the landmarks in space, standing where it projects to its landmarks."""
     where = torch.where(seen.space_weight[..., None] > 0, seen.space, torch.nan)
     guesses = [first_pose(points, one) for one in where]
-    # Each camera has a guess of its own; at each moment the one that sees most is taken, of those that know any.
+    # Each camera has a guess of its own; in each frame the one that sees most is taken, of those that know any.
     surest = seen.weight.sum(-1)[: len(guesses)] if len(guesses) > 1 else torch.zeros(1, len(where[0]))
     best = torch.where(torch.stack([known for _, _, known in guesses]), surest, surest - 1e3).argmax(0)
     guess, pose = (torch.stack([g[part] for g in guesses])[best, torch.arange(len(best))] for part in (0, 1))

@@ -33,7 +33,7 @@ class Outlines:
         cell: pixels from one cell to the next.
         points: places on the outline, pixels (column, row).
         normals: of the outline there, unit, outwards.
-        known: 1 for moments with a mask, else 0; the others' arrays hold nothing of use.
+        known: 1 for frames with a mask, else 0; the others' arrays hold nothing of use.
         size: median over the clip of the longer side of the mask's box, pixels.
     """
 
@@ -61,7 +61,7 @@ class Outlines:
 
 
 Mask = UInt8[np.ndarray, "h w"] | Path
-"""A mask (0..255, the person above 127) or the picture file that holds it."""
+"""A mask (0..255, the person above 127) or the image file that holds it."""
 
 
 def open_mask(mask: Mask) -> UInt8[np.ndarray, "h w"]:
@@ -101,7 +101,7 @@ def _trace(mask: UInt8[np.ndarray, "h w"]) -> tuple[np.ndarray, ...]:
     # Areas where pixels are smaller than cells; where they are larger, areas would make stairs.
     grid = np.asarray(window.resize((GRID, GRID), Image.Resampling.BOX if cell > 1 else Image.Resampling.BILINEAR))
     centers = corner[:, None] + cell * np.arange(GRID)
-    # Beyond the picture nothing is known: the person may go on there.
+    # Beyond the image nothing is known: the person may go on there.
     beyond = ~(
         ((centers[1] > -0.5) & (centers[1] < mask.shape[0] - 0.5))[:, None]
         & ((centers[0] > -0.5) & (centers[0] < mask.shape[1] - 0.5))[None]

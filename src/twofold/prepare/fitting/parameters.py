@@ -70,7 +70,7 @@ class Posed:
     """A moving body, ready to place any of its points.
 
     Attributes:
-        transforms: from the T-pose to the world, one for each joint and moment.
+        transforms: from the T-pose to the world, one for each joint and frame.
         vertices: T-pose vertices of this shape, metres.
     """
 
@@ -87,7 +87,7 @@ class Posed:
 
 @dataclass(frozen=True)
 class Chosen:
-    """Some vertices of a body, the same at every moment (`n`) or others at each (`t n`).
+    """Some vertices of a body, the same in every frame (`n`) or others at each (`t n`).
 
     Attributes:
         index: which.
@@ -109,7 +109,7 @@ def choose(body: Body, index: Int[Tensor, "*t n"]) -> Chosen:
 
 
 def pose_motion(body: Body, motion: Motion) -> Posed:
-    """The body at every moment (pose blend shapes are left out: they are millimetres, the landmarks' error is not)."""
+    """The body in every frame (pose blend shapes are left out: they are millimetres, the landmarks' error is not)."""
     n = motion.betas.shape[0]
     joints = body.joints + body.joint_basis[..., :n] @ motion.betas
     vertices = body.template + body.shape_basis[..., :n] @ motion.betas

@@ -1,4 +1,4 @@
-"""Poses that the user has: of every picture of a clip, relative to the T-pose of the body that is taken."""
+"""Poses that the user has: of every image of a clip, relative to the T-pose of the body that is taken."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,8 +27,8 @@ def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], bo
         path: with `poses` (F x 24 x 3 or F x 72: axis-angle, root first, radians), `translations` (F x 3, metres; also
             called `transl` or `trans`) and, if they are known, `betas`. One camera: in its axes (x right, y down, z
             forward). Several: in the calibration's world.
-        info: of the clip; F is how many pictures it has.
-        sources: which of its pictures are used.
+        info: of the clip; F is how many images it has.
+        sources: which of its images are used.
         body: whose joints these are.
 
     Raises:
@@ -40,7 +40,7 @@ def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], bo
     places = _finite(arrays, _PLACES, path)
     if poses.ndim < 2 or poses[0].size != 3 * _JOINTS:
         raise TwofoldError(
-            f"{path}: `poses` is {' x '.join(map(str, poses.shape))}, expected pictures x 24 x 3 (SMPL's joints)."
+            f"{path}: `poses` is {' x '.join(map(str, poses.shape))}, expected images x 24 x 3 (SMPL's joints)."
         )
     frames = len(poses)
     if places.shape != (frames, 3):
@@ -48,7 +48,7 @@ def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], bo
         raise TwofoldError(f"{path}: {frames} poses need translations of {frames} x 3; they are {shape}.")
     if not info.sources <= frames <= info.sources + max(1, info.sources // 50):
         raise TwofoldError(
-            f"{path} has poses of {frames} pictures, and the clip has {info.sources}; give one for every picture."
+            f"{path} has poses of {frames} images, and the clip has {info.sources}; give one for every image."
         )
     pose = torch.from_numpy(poses.reshape(frames, _JOINTS, 3)).float()
     motion = Motion(
@@ -60,7 +60,7 @@ def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], bo
 
 
 def motion_at(motion: Motion, sources: Sequence[int]) -> Motion:
-    """The motion at some moments, by their numbers."""
+    """The motion in some frames, by their numbers."""
     chosen = torch.tensor(list(sources))
     return replace(
         motion, guess=motion.guess[chosen], root=motion.root[chosen], pose=motion.pose[chosen],
@@ -85,7 +85,7 @@ def _betas(arrays: dict[str, np.ndarray], body: Body, path: Path) -> Float[Tenso
         return betas
     given = np.atleast_2d(_finite(arrays, ("betas",), path).astype(np.float32))
     if (given != given[0]).any():
-        raise TwofoldError(f"{path}: `betas` changes from picture to picture; a person has one shape, give its mean.")
+        raise TwofoldError(f"{path}: `betas` changes from image to image; a person has one shape, give its mean.")
     count = min(len(betas), given.shape[1])
     betas[:count] = torch.from_numpy(given[0, :count])
     return betas

@@ -40,7 +40,7 @@ def stand_upright(
     translations: Float[Tensor, "t 3"],
     cameras: Mapping[str, Camera],
 ) -> tuple[Float[Tensor, "t 24 3"], Float[Tensor, "t 3"], dict[str, Camera]]:
-    """Motion and cameras in a world with y up, its floor at 0, the person around x = z = 0; no picture changes.
+    """Motion and cameras in a world with y up, its floor at 0, the person around x = z = 0; no image changes.
 
     Args:
         up: unit vector of the world as it is.

@@ -1,4 +1,4 @@
-"""How well the fitted body agrees with each picture, which pictures to leave out, and when a clip cannot work."""
+"""How well the fitted body agrees with each image, which images to leave out, and when a clip cannot work."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from twofold.prepare.silhouettes import LEAST_IOU, MOST_BAD
 from twofold.prepare.turning import FULL_TURN
 
 MOST_REPROJECTION, LEAST_VISIBILITY = 4.0, 0.5
-"""A picture above, below these is left out: measured on real clips, failed fits lie well beyond."""
+"""An image above, below these is left out: measured on real clips, failed fits lie well beyond."""
 
 LEAST_PICTURES = 12
 """Fewer show too little of a person to learn how it moves."""
@@ -33,16 +33,16 @@ _ENDS = ("nose", "left_ankle", "right_ankle", "left_wrist", "right_wrist")
 
 @dataclass(frozen=True)
 class PictureQuality:
-    """How well one picture is understood.
+    """How well one image is understood.
 
     Attributes:
-        camera: whose picture.
-        time: which moment of the capture.
+        camera: whose image.
+        time: which frame of the capture.
         iou: of the body's silhouette and the mask.
         reprojection: mean error of the landmarks that are seen, pixels.
-        reprojection_percent: the same in percent of the person's height in the pictures.
+        reprojection_percent: the same in percent of the person's height in the images.
         visibility: mean over the landmarks.
-        cropped: the head, or a hand or foot, is beyond the picture's edge.
+        cropped: the head, or a hand or foot, is beyond the image's edge.
         fault: why it is left out; empty where it is kept.
     """
 
@@ -74,17 +74,17 @@ def picture_quality(
     height: float,
     alone: bool = True,
 ) -> PictureQuality:
-    """The record of one picture.
+    """The record of one image.
 
     Args:
-        camera_name: whose picture.
+        camera_name: whose image.
         camera: that camera.
-        time: which moment.
+        time: which frame.
         iou: of silhouette and mask.
         shown: where the fitted body's landmarks project to.
         pixels: where the estimator saw them; NaN where it did not.
         visibility: 0..1.
-        height: of the person in this camera's pictures, pixels.
+        height: of the person in this camera's images, pixels.
         alone: no other camera saw the person. Where one did, landmarks that are missed are the estimator's fault.
     """
     known = np.isfinite(pixels).all(-1)
@@ -106,7 +106,7 @@ def picture_quality(
 
 
 def _beyond(pixel: Float[np.ndarray, "2"], camera: Camera, margin: float) -> bool:
-    """Whether a landmark lies outside the picture by more than a share of its size."""
+    """Whether a landmark lies outside the image by more than a share of its size."""
     size = np.array([camera.width, camera.height])
     return bool(np.isfinite(pixel).all() and ((pixel < -margin * size) | (pixel > (1 + margin) * size)).any())
 
@@ -115,11 +115,11 @@ def require_length(pictures: int, clip: str) -> None:
     """Refuses clips that are too short.
 
     Raises:
-        TwofoldError: there are fewer pictures than `LEAST_PICTURES`.
+        TwofoldError: there are fewer images than `LEAST_PICTURES`.
     """
     if pictures < LEAST_PICTURES:
         raise TwofoldError(
-            f"{clip} has {pictures} pictures, expected at least {LEAST_PICTURES} (a few seconds of a moving person); "
+            f"{clip} has {pictures} images, expected at least {LEAST_PICTURES} (a few seconds of a moving person); "
             "film longer, or raise --fps if it was lowered."
         )
 
@@ -137,39 +137,38 @@ def require_person(track: Track, clip: str, advice: str = LARGER) -> None:
     """
     share = float(track.found.mean())
     if share < 1 - MOST_BAD:
-        found = "nobody" if share == 0 else f"a person in only {100 * share:.0f} % of the pictures"
+        found = "nobody" if share == 0 else f"a person in only {100 * share:.0f} % of the images"
         raise TwofoldError(f"{clip} shows {found}; {advice}.")
 
 
 def require_whole(qualities: Sequence[PictureQuality], clip: str, advice: str = FARTHER) -> None:
-    """Refuses clips in which the person is cut off by the picture's edge most of the time.
+    """Refuses clips in which the person is cut off by the image's edge most of the time.
 
     Args:
-        qualities: of the clip's pictures.
+        qualities: of the clip's images.
         clip: for the message.
         advice: what to do, to end it.
 
     Raises:
-        TwofoldError: in more than half of the pictures.
+        TwofoldError: in more than half of the images.
     """
     share = float(np.mean([q.cropped for q in qualities]))
     if share > 0.5:
         raise TwofoldError(
-            f"In {100 * share:.0f} % of the pictures of {clip} head, hands or feet are beyond the picture's edge; "
-            f"{advice}."
+            f"In {100 * share:.0f} % of the images of {clip} head, hands or feet are beyond the image's edge; {advice}."
         )
 
 
 def kept_times(
     qualities: Sequence[PictureQuality], clip: str, advice: str = STEADIER, drop: Sequence[int] = ()
 ) -> tuple[list[int], dict[int, str]]:
-    """Moments at which no camera's picture is bad, and why each other one is left out.
+    """Frames at which no camera's image is bad, and why each other one is left out.
 
     Args:
-        qualities: of all pictures.
+        qualities: of all images.
         clip: for the message.
         advice: what to do, to end it.
-        drop: moments that the user wants left out; these do not count as bad.
+        drop: frames that the user wants left out; these do not count as bad.
 
     Raises:
         TwofoldError: too many are bad, with the commonest reasons; or fewer than two are left.
@@ -183,12 +182,12 @@ def kept_times(
     if len(faults) > MOST_BAD * len(times):
         example = min(faults)
         raise TwofoldError(
-            f"{len(faults)} of {len(times)} pictures of {clip} could not be understood (moments {spans(faults)}); at "
+            f"{len(faults)} of {len(times)} images of {clip} could not be understood (frames {spans(faults)}); at "
             f"{example}, for one, {faults[example]}; {advice}."
         )
     kept = [time for time in times if time not in reasons]
     if len(kept) < 3:
-        raise TwofoldError(f"--drop leaves {len(kept)} pictures of {clip}; leave out fewer.")
+        raise TwofoldError(f"--drop leaves {len(kept)} images of {clip}; leave out fewer.")
     return kept, reasons
 
 
@@ -200,8 +199,8 @@ def warnings_about(
     Args:
         yaw: from `turning.arc`, over the training camera.
         moved: how far the background moves, pixels; None where that cannot be told.
-        width: of the pictures.
-        left_out: moments left out, and why.
+        width: of the images.
+        left_out: frames left out, and why.
         several: more than one camera saw the person, so that one camera's yaw says less.
     """
     words: list[str] = []
@@ -221,12 +220,12 @@ def warnings_about(
             "--set method.rates.pose=1e-4, so that they move little."
         )
     if left_out:
-        words.append(f"{len(left_out)} moments were left out: {reasons_in_words(left_out)}.")
+        words.append(f"{len(left_out)} frames were left out: {reasons_in_words(left_out)}.")
     return words
 
 
 def reasons_in_words(left_out: Mapping[int, str]) -> str:
-    """Moments by why they are left out; what was measured at one of them stands for all.
+    """Frames by why they are left out; what was measured at one of them stands for all.
 
     >>> reasons_in_words({3: "nobody was found", 5: "nobody was found", 4: "too blurred (0.2)"})
     '3, 5 (nobody was found); 4 (too blurred)'

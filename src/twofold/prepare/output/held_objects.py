@@ -35,7 +35,7 @@ class SeenBody:
 
     @property
     def window(self) -> tuple[slice, slice]:
-        """The rows and columns of the picture that `vertex` covers."""
+        """The rows and columns of the image that `vertex` covers."""
         (row, column), (height, width) = self.top, self.vertex.shape
         return slice(row, row + height), slice(column, column + width)
 
@@ -84,8 +84,8 @@ def see_body(
         depth: of the vertices, metres, all above 0.
         faces: its triangles.
         focal: of the camera, pixels.
-        height: of the picture.
-        width: of the picture.
+        height: of the image.
+        width: of the image.
         tolerance: a vertex so far behind the painted surface still counts as seen, metres.
     """
     pixels_per_metre = focal / float(np.median(depth))
@@ -137,13 +137,13 @@ def unlikeness(
     trusted: Bool[np.ndarray, "V"],
     shift: float = 0.03,
 ) -> Float[np.ndarray, "h w"]:
-    """How far the colours of a picture are from all usual ones near them, mean of the channels.
+    """How far the colours of an image are from all usual ones near them, mean of the channels.
 
     So folds, shading and the edges of a shirt do not count. Beside the body the nearest part of it is expected; 0 where
     nothing is.
 
     Args:
-        image: the picture.
+        image: the image.
         mask: where to look, beside the body.
         seen: the fitted body.
         usual: colours of the body's vertices, 0..1 (`usual_colors`).
@@ -181,7 +181,7 @@ def object_mask(
     together with it and has its colour, as far as that is off the body or not the body's colour, and a rim.
 
     Args:
-        image: the picture.
+        image: the image.
         mask: as estimated.
         seen: the fitted body in it.
         unlike: how far its colours are from the usual ones (`unlikeness`).
@@ -221,7 +221,7 @@ def objects_beside(
 
     Args:
         person: the mask.
-        seen: the fitted body in the picture.
+        seen: the fitted body in the image.
         unlike: how far its colours are from the usual ones (`unlikeness`).
         difference: from here on a colour is unlike.
     """
@@ -246,7 +246,7 @@ def _least_difference(
     height, width = where.shape
     rows, columns = np.nonzero(where)
     least = np.zeros((height, width), dtype=np.float32)
-    # Some hundred places are enough, however large the picture.
+    # Some hundred places are enough, however large the image.
     steps = np.arange(-int(radius), int(radius) + 1, 1 + int(radius) // 7)
     moves = [(r, c) for r in steps for c in steps if r * r + c * c <= radius * radius]
     least[where] = np.inf

@@ -1,4 +1,4 @@
-"""The fitted body held against every picture: objects taken out of the masks, and a record of each picture."""
+"""The fitted body held against every image: objects taken out of the masks, and a record of each image."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -26,17 +26,17 @@ from twofold.prepare.output.object_tracks import Patch, Sighting, foreign_patche
 from twofold.prepare.silhouettes import overlap, silhouette
 
 _COLOR_SAMPLE = 120
-"""Pictures from which a vertex's usual colour is learned."""
+"""Images from which a vertex's usual colour is learned."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """What came of one camera's pictures.
+    """What came of one camera's images.
 
     Attributes:
-        qualities: one for each picture.
-        ignored: files of the pixels that objects hide, by moment.
-        removed: share of the person's mask that these take, by moment.
+        qualities: one for each image.
+        ignored: files of the pixels that objects hide, by frame.
+        removed: share of the person's mask that these take, by frame.
     """
 
     qualities: tuple[PictureQuality, ...]
@@ -55,15 +55,15 @@ def compare_with_pictures(
     alone: bool,
     show: Callable[[float], None],
 ) -> Agreement:
-    """Goes through a camera's pictures with the body that was fitted; masks with objects in them are written anew.
+    """Goes through a camera's images with the body that was fitted; masks with objects in them are written anew.
 
     Args:
         name: of the camera.
         camera: with the focal length that was found.
-        watched: pictures, masks and landmarks.
+        watched: images, masks and landmarks.
         body: that was fitted.
         motion: settled, in the camera's world.
-        size: of the person in the pictures, pixels.
+        size: of the person in the images, pixels.
         held_objects: "remove" takes balls and the like out of the masks and marks what they hide.
         alone: no other camera saw the person.
         show: told the share that is done.
@@ -111,7 +111,7 @@ def compare_with_pictures(
         )
 
     qualities: list[PictureQuality] = []
-    # Painting, comparing and writing pictures leave the interpreter free most of the time.
+    # Painting, comparing and writing images leave the interpreter free most of the time.
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
         if usual is not None:
             sightings: list[Sighting | None] = []

@@ -28,13 +28,13 @@ Choice = Literal["largest", "masks"] | int
 """The largest person of the first image, the one that the user's own masks show, or the N-th from the left."""
 
 FOCAL_GUESS = 1.1
-"""Times the longer side of a picture: between a phone's wide lens and a camera's usual one."""
+"""Times the longer side of an image: between a phone's wide lens and a camera's usual one."""
 
 _SAME_RATE = 1.01
 """Rates that differ by less are the same: time stamps are rounded."""
 
 _LENS_MATTERS = 0.5
-"""Pictures are straightened where the lens moves a point by more pixels than this."""
+"""Images are straightened where the lens moves a point by more pixels than this."""
 
 
 @dataclass(frozen=True)
@@ -42,21 +42,21 @@ class PrepareConfig:
     """What to make of the clips.
 
     Attributes:
-        fps: pictures a second to use; None for all.
-        max_size: longer side of the pictures, pixels; larger ones are made smaller.
+        fps: images a second to use; None for all.
+        max_size: longer side of the images, pixels; larger ones are made smaller.
         intrinsics: fx, fy, cx, cy in pixels of the clip itself; None to find the focal length.
         calibration: file or folder with the cameras of several clips.
         train_camera: which clip trains where there are several, by its name; None for the first.
-        held_out: of so many moments one is kept for testing.
+        held_out: of so many frames one is kept for testing.
         held_objects: whether balls and the like are taken out of the masks.
-        credit: whom to name when showing the pictures.
+        credit: whom to name when showing the images.
         masks: the user's own, instead of the estimator's.
         landmarks: likewise.
         poses: likewise; nothing is fitted then.
         several_people: whether a second person in view ends it.
         person: which of several people is meant; None for whom the user's own masks, landmarks or poses show, else for
             the only one.
-        drop: moments that are left out of the splits.
+        drop: frames that are left out of the splits.
     """
 
     fps: float | None = None
@@ -76,7 +76,7 @@ class PrepareConfig:
 
 
 _HINTS = {
-    "masks": "is each white on the person of its own picture?",
+    "masks": "is each white on the person of its own image?",
     "landmarks": "are they of this clip, in pixels of its full size?",
     "poses": "are they of this clip and body, in metres and radians, before the camera?",
     "calibration": "do its cameras' names go with the videos', and is it of this recording and of images of this size?",
@@ -86,7 +86,7 @@ _HINTS = {
 
 
 def advice(config: PrepareConfig, film: str, pieces: Sequence[str] = tuple(_HINTS)) -> str:
-    """What to do about pictures that are not understood, the end of a sentence.
+    """What to do about images that are not understood, the end of a sentence.
 
     Args:
         config: what was given.
@@ -110,10 +110,10 @@ class Clip:
     Attributes:
         name: of its camera.
         path: where it lies.
-        frames: its pictures.
+        frames: its images.
         info: what will come of it.
-        camera: that took it, for pictures without distortion.
-        lens: how to take the distortion out of a picture; None where there is next to none.
+        camera: that took it, for images without distortion.
+        lens: how to take the distortion out of an image; None where there is next to none.
         calibrated: the camera in the calibration's precision; None where it was guessed.
     """
 
@@ -178,7 +178,7 @@ def require_options(clips: Sequence[Path], config: PrepareConfig) -> None:
         TwofoldError: as it says.
     """
     if not clips:
-        raise TwofoldError("Expected at least one video or folder of pictures; none was given.")
+        raise TwofoldError("Expected at least one video or folder of images; none was given.")
     if len(clips) > 1 and config.calibration is None:
         raise TwofoldError(
             f"{len(clips)} videos were given, which need --calibration FILE to say where their cameras stand; "
@@ -198,9 +198,7 @@ def require_options(clips: Sequence[Path], config: PrepareConfig) -> None:
     if isinstance(config.person, int) and config.person < 1:
         raise TwofoldError(f"--person counts people from the left, from 1; it is {config.person}.")
     if config.held_out < 3:
-        raise TwofoldError(
-            f"One moment of {config.held_out} cannot be held out between two that train; take 3 or more."
-        )
+        raise TwofoldError(f"One frame of {config.held_out} cannot be held out between two that train; take 3 or more.")
 
 
 def open_clips(clips: Sequence[Path], config: PrepareConfig) -> list[Clip]:
@@ -238,7 +236,7 @@ def open_clips(clips: Sequence[Path], config: PrepareConfig) -> list[Clip]:
 
 
 def rate_of(seconds: Float[np.ndarray, "t"], fps: float) -> float:
-    """Moments per second: `fps` if their times agree with it, else what these are on average.
+    """Frames per second: `fps` if their times agree with it, else what these are on average.
 
     >>> rate_of(np.array([0.0, 0.1, 0.2]), 10.0), rate_of(np.array([0.0, 0.1, 0.4]), 10.0)
     (10.0, 5.0)
@@ -263,7 +261,7 @@ def _guessed(info: ClipInfo, config: PrepareConfig) -> Camera:
     """A camera at the world's origin.
 
     Raises:
-        TwofoldError: the lens that was given belongs to no picture of this size.
+        TwofoldError: the lens that was given belongs to no image of this size.
     """
     across, down = info.width / info.full_width, info.height / info.full_height
     if config.intrinsics is None:
@@ -286,7 +284,7 @@ def _guessed(info: ClipInfo, config: PrepareConfig) -> Camera:
 
 
 def _smaller(lens: CalibratedCamera, info: ClipInfo) -> CalibratedCamera:
-    """The lens as it is in the smaller pictures; distortion does not change with the size."""
+    """The lens as it is in the smaller images; distortion does not change with the size."""
     scale = np.array([info.width / info.full_width, info.height / info.full_height])
     intrinsics = lens.intrinsics.copy()
     intrinsics[:2] *= scale[:, None]

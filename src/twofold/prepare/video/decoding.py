@@ -1,4 +1,4 @@
-"""A video file as upright pictures, one after the other, each with its time."""
+"""A video file as upright images, one after the other, each with its time."""
 
 import contextlib
 from collections.abc import Generator, Iterator
@@ -25,7 +25,7 @@ _SAME_RATE = 0.01  # Time stamps are rounded, often to milliseconds: rates that 
 
 @dataclass(frozen=True)
 class Orientation:
-    """How stored pictures are brought upright: first transposed, then reversed.
+    """How stored images are brought upright: first transposed, then reversed.
 
     Attributes:
         transpose: rows become columns.
@@ -40,7 +40,7 @@ class Orientation:
     off: float = 0.0
 
     def upright(self, image: Shaped[np.ndarray, "h w *c"]) -> Shaped[np.ndarray, "H W *c"]:
-        """A stored picture as it is meant to be seen."""
+        """A stored image as it is meant to be seen."""
         turned = np.swapaxes(image, 0, 1) if self.transpose else image
         turned = turned[::-1] if self.flip_rows else turned
         return turned[:, ::-1] if self.flip_columns else turned
@@ -63,13 +63,13 @@ def orientation(matrix: bytes) -> Orientation:
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a file says of its pictures, held against the first one.
+    """What a file says of its images, held against the first one.
 
     Attributes:
-        width: columns of an upright picture with square pixels.
+        width: columns of an upright image with square pixels.
         height: its rows.
         orientation: how it is brought upright.
-        fps: pictures per second by their time stamps, on average.
+        fps: images per second by their time stamps, on average.
         frames: how many there are; those that are damaged count.
         duration: seconds, about.
         says_duration: the file itself says how long it is.
@@ -87,17 +87,17 @@ class VideoInfo:
 
 
 def describe_video(path: Path) -> VideoInfo:
-    """What is known after the first picture.
+    """What is known after the first image.
 
     Raises:
-        TwofoldError: the file is missing, no video, sound only, or no picture in it can be decoded.
+        TwofoldError: the file is missing, no video, sound only, or no image in it can be decoded.
     """
     with _opened(path) as (container, stream):
         remarks: list[str] = []
         stated = stream.average_rate or stream.guessed_rate
         first = next(_pictures(container, stream, []), None)
         if first is None:
-            raise TwofoldError(f"No picture of {path} can be decoded; it is damaged or empty, export it again.")
+            raise TwofoldError(f"No image of {path} can be decoded; it is damaged or empty, export it again.")
         matrix = first.side_data.get("DISPLAYMATRIX")
         turn = Orientation() if matrix is None else orientation(bytes(memoryview(matrix)))
         if turn.off > 3:
@@ -118,7 +118,7 @@ def describe_video(path: Path) -> VideoInfo:
 
 
 def _rate(stated: Fraction | None, measured: float | None, path: Path, remarks: list[str]) -> float:
-    """Pictures per second: what the file states where its time stamps agree, else what these show."""
+    """Images per second: what the file states where its time stamps agree, else what these show."""
     given = 0.0 if stated is None else float(stated)
     possible = 0.1 <= given <= 1000
     if measured is None or not 0.1 <= measured <= 1000:
@@ -137,9 +137,9 @@ def _rate(stated: Fraction | None, measured: float | None, path: Path, remarks: 
 
 
 def decode(path: Path, info: VideoInfo, remarks: list[str]) -> Generator[tuple[float, av.VideoFrame]]:
-    """The pictures of a video as they are stored, each with the seconds since the first one.
+    """The images of a video as they are stored, each with the seconds since the first one.
 
-    Pieces that cannot be decoded are left out. Times always grow: where the file's clock jumps, the next picture comes
+    Pieces that cannot be decoded are left out. Times always grow: where the file's clock jumps, the next image comes
     one step after the last.
 
     Args:
@@ -164,7 +164,7 @@ def decode(path: Path, info: VideoInfo, remarks: list[str]) -> Generator[tuple[f
             yield seconds, frame
             last, count = seconds, count + 1
     if jumps:
-        remarks.append(f"The clock of {path.name} jumps at {jumps} pictures; they are taken as following closely.")
+        remarks.append(f"The clock of {path.name} jumps at {jumps} images; they are taken as following closely.")
     ended = last + 1 / info.fps
     if info.says_duration and ended < info.duration - max(0.5, 0.05 * info.duration):
         remarks.append(
@@ -176,18 +176,18 @@ def decode(path: Path, info: VideoInfo, remarks: list[str]) -> Generator[tuple[f
 
 
 class Converter:
-    """Makes upright 8-bit sRGB arrays of one size from decoded pictures."""
+    """Makes upright 8-bit sRGB arrays of one size from decoded images."""
 
     def __init__(self, info: VideoInfo, width: int, height: int) -> None:
-        """Pictures come out with `width` columns and `height` rows, averaged over areas."""
+        """Images come out with `width` columns and `height` rows, averaged over areas."""
         self._turn = info.orientation
         self._stored = (height, width) if info.orientation.transpose else (width, height)
         self._reformatter = VideoReformatter()
 
     def __call__(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
-        """The picture."""
+        """The image."""
         width, height = self._stored
-        # Players take the newer matrix for large pictures that name none.
+        # Players take the newer matrix for large images that name none.
         unnamed = int(frame.colorspace) == 2 and frame.height >= 720
         rgb = self._reformatter.reformat(
             frame, width, height, "rgb24", interpolation=Interpolation.AREA,
@@ -218,7 +218,7 @@ def _opened(path: Path) -> Generator[tuple[InputContainer, VideoStream]]:
         covers = Disposition.attached_pic
         videos = [stream for stream in container.streams.video if not stream.disposition & covers]
         if not videos:
-            what = "holds only sound" if container.streams.audio else "holds no pictures"
+            what = "holds only sound" if container.streams.audio else "holds no images"
             raise TwofoldError(f"{path} {what}; a video of a person is needed.")
         stream = videos[0]
         try:
@@ -229,7 +229,7 @@ def _opened(path: Path) -> Generator[tuple[InputContainer, VideoStream]]:
 
 
 def _pictures(container: InputContainer, stream: VideoStream, damaged: list[str]) -> Iterator[av.VideoFrame]:
-    """All pictures that can be decoded; what cannot is noted in `damaged`."""
+    """All images that can be decoded; what cannot is noted in `damaged`."""
     packets = container.demux(stream)
     while True:
         try:

@@ -1,4 +1,4 @@
-"""A video, or a folder of pictures, as upright pictures at even steps of time."""
+"""A video, or a folder of images, as upright images at even steps of time."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -17,11 +17,11 @@ from twofold.prepare.video.intensity import deep_values, to_8_bits, white_level
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 USUAL_FPS = 30.0
-"""Taken for a folder of pictures, which cannot say it."""
+"""Taken for a folder of images, which cannot say it."""
 Item = TypeVar("Item")
 
 _ORIENTATION = 0x0112  # The EXIF field.
-_FASTER = 1.1  # More pictures than a clip has would come twice; clips state their rate only roughly.
+_FASTER = 1.1  # More images than a clip has would come twice; clips state their rate only roughly.
 
 
 @dataclass(frozen=True)
@@ -29,17 +29,17 @@ class ClipInfo:
     """What will come of a clip.
 
     Attributes:
-        width: columns of each picture.
-        height: rows of each picture.
-        fps: pictures per second, on average.
+        width: columns of each image.
+        height: rows of each image.
+        fps: images per second, on average.
         frames: how many, about; damaged ones are counted here and do not come.
         duration: seconds, about.
-        full_width: columns before pictures are made smaller.
-        full_height: rows before pictures are made smaller.
-        sources: how many pictures the clip itself has.
-        names: what the pictures of a folder are called, without ending; none for a video.
+        full_width: columns before images are made smaller.
+        full_height: rows before images are made smaller.
+        sources: how many images the clip itself has.
+        names: what the images of a folder are called, without ending; none for a video.
         remarks: a sentence for each thing the user should know.
-        white: the value of white in pictures of a folder (`intensity.white_level`); 255 for a video.
+        white: the value of white in images of a folder (`intensity.white_level`); 255 for a video.
     """
 
     width: int
@@ -57,15 +57,15 @@ class ClipInfo:
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture of a clip.
+    """One image of a clip.
 
     Attributes:
         index: how many came before it.
         seconds: when it was taken, since the first one, by its own time stamp.
         image: 8-bit sRGB.
-        source: which picture of the clip itself it is, counted from 0 and before any are left out.
+        source: which image of the clip itself it is, counted from 0 and before any are left out.
         step: the even step of time (step / fps seconds) that it stands for; grows, with gaps where the clip has no
-            picture near a step.
+            image near a step.
     """
 
     index: int
@@ -77,11 +77,11 @@ class Picture:
 
 @final
 class Frames:
-    """The pictures of a clip in order, each once, decoded while they are asked for; may be gone through again.
+    """The images of a clip in order, each once, decoded while they are asked for; may be gone through again.
 
     Attributes:
         info: what will come.
-        remarks: sentences for the user; complete when all pictures have come.
+        remarks: sentences for the user; complete when all images have come.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Frames:
         self.remarks = self.info.remarks
 
     def __iter__(self) -> Iterator[Picture]:
-        """Every picture.
+        """Every image.
 
         Raises:
             TwofoldError: one in a folder is damaged.
@@ -123,18 +123,18 @@ class Frames:
 
 
 def describe(clip: Path | str, fps: float | int | None = None, max_size: int | None = None) -> ClipInfo:
-    """What will come of a clip; only its first picture is decoded.
+    """What will come of a clip; only its first image is decoded.
 
     Args:
-        clip: a video in any form that FFmpeg reads, turned upright as it asks for, or a folder of pictures, taken in
+        clip: a video in any form that FFmpeg reads, turned upright as it asks for, or a folder of images, taken in
             natural order (2 before 10).
-        fps: pictures per second; of those nearest to one step of time one comes, and none comes twice. By default all
-            pictures of a video come, at their own times. For a folder: how fast its pictures were taken (30 by
+        fps: images per second; of those nearest to one step of time one comes, and none comes twice. By default all
+            images of a video come, at their own times. For a folder: how fast its images were taken (30 by
             default); all of them come.
         max_size: the longer side is made this long at most, in pixels; averaged over areas.
 
     Raises:
-        TwofoldError: missing, damaged, of another kind, sound only; a folder without pictures or with pictures of
+        TwofoldError: missing, damaged, of another kind, sound only; a folder without images or with images of
             several sizes; an impossible `fps` or `max_size`.
     """
     return _look_at(Path(clip), fps, max_size)[3]
@@ -183,12 +183,12 @@ def natural_order(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def picture_files(folder: Path) -> tuple[Path, ...]:
-    """The pictures in a folder in natural order.
+    """The images in a folder in natural order.
 
     Raises:
         TwofoldError: there is none.
     """
-    return files_with(folder, PICTURE_ENDINGS, "pictures; expected PNG or JPEG files, one for each frame")
+    return files_with(folder, PICTURE_ENDINGS, "images; expected PNG or JPEG files, one for each frame")
 
 
 def files_with(folder: Path, endings: tuple[str, ...], what: str) -> tuple[Path, ...]:
@@ -207,16 +207,16 @@ def files_with(folder: Path, endings: tuple[str, ...], what: str) -> tuple[Path,
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Columns and rows of a picture as it is meant to be seen; its pixels are not read.
+    """Columns and rows of an image as it is meant to be seen; its pixels are not read.
 
     Raises:
-        TwofoldError: it is no picture.
+        TwofoldError: it is no image.
     """
     return upright_size(path)
 
 
 def read_picture(path: Path, info: ClipInfo) -> UInt8[np.ndarray, "h w 3"]:
-    """One picture of a folder, upright and of the clip's size; transparency is ignored.
+    """One image of a folder, upright and of the clip's size; transparency is ignored.
 
     Raises:
         TwofoldError: it cannot be decoded.
@@ -248,18 +248,18 @@ def shrunk(width: int, height: int, max_size: int | None) -> tuple[int, int]:
 def _look_at(
     clip: Path, fps: float | int | None, max_size: int | None
 ) -> tuple[Path, tuple[Path, ...], VideoInfo | None, ClipInfo]:
-    """The clip, its pictures if it is a folder, else what kind of video it is; and what will come of it."""
+    """The clip, its images if it is a folder, else what kind of video it is; and what will come of it."""
     if fps is not None and not 0.01 <= fps <= 1000:
-        raise TwofoldError(f"The frame rate {fps:g} makes no sense; give pictures per second, 10 for example.")
+        raise TwofoldError(f"The frame rate {fps:g} makes no sense; give images per second, 10 for example.")
     if max_size is not None and max_size < 64:
-        raise TwofoldError(f"Pictures with a longer side of {max_size} show too little; give at least 64 pixels.")
+        raise TwofoldError(f"Images with a longer side of {max_size} show too little; give at least 64 pixels.")
     if clip.is_dir():
         files = picture_files(clip)
         width, height = picture_size(files[0])
         for path in files[1:]:
             if (size := picture_size(path)) != (width, height):
                 raise TwofoldError(
-                    f"The pictures in {clip} have several sizes: {files[0].name} is {width} x {height}, {path.name} is "
+                    f"The images in {clip} have several sizes: {files[0].name} is {width} x {height}, {path.name} is "
                     f"{size[0]} x {size[1]}; keep those of one clip."
                 )
         rate, names = float(fps or USUAL_FPS), tuple(path.stem for path in files)
@@ -272,7 +272,7 @@ def _look_at(
     video = describe_video(clip)
     if fps is not None and fps > _FASTER * video.fps:
         raise TwofoldError(
-            f"{fps:g} pictures a second were asked for, and {clip.name} has {video.fps:.4g}; ask for that at most."
+            f"{fps:g} images a second were asked for, and {clip.name} has {video.fps:.4g}; ask for that at most."
         )
     rate = float(fps or video.fps)
     count = max(round(video.frames * rate / video.fps), 1)

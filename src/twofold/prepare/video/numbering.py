@@ -61,8 +61,8 @@ def numberings(files: Sequence[Path], info: ClipInfo, what: str) -> list[Numberi
         return _in_order(files, info.sources)
     range_of = f", numbered from {min(numbers)} to {max(numbers)}" if numbered else ""
     raise TwofoldError(
-        f"{files[0].parent} holds {len(files)} {what}{range_of}, and the clip has {info.sources} pictures; number them "
-        "as its pictures are, from 0, or give one for each."
+        f"{files[0].parent} holds {len(files)} {what}{range_of}, and the clip has {info.sources} images; number them "
+        "as its images are, from 0, or give one for each."
     )
 
 
