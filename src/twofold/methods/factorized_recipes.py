@@ -165,7 +165,7 @@ def quick() -> Recipe:
 def demo_recipe(seed: int) -> Recipe:
     """`quick` with as many steps as two minutes of two cores hold."""
     recipe = quick()
-    # With few pictures and exact poses, slower rates show unseen views better.
+    # With few images and exact poses, slower rates show unseen views better.
     rates = replace(recipe.method.rates, grid=5e-3, low=1e-3, high=1e-3)
     training = replace(recipe.training, steps=900, checkpoint_every=300, preview_every=0)
     # The studio's poses are exact; there is nothing to correct.
