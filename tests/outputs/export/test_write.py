@@ -174,3 +174,19 @@ def test_missing_package_is_named_before_baking(avatar, person, tmp_path, monkey
     monkeypatch.setattr(write.importlib.util, "find_spec", lambda name: None if name == "xatlas" else found(name))
     with pytest.raises(TwofoldError, match=r"needs xatlas; run pip install 'twofold\[export\]'"):
         export(avatar, person, tmp_path / "exports", ExportRequest(config=SMALL))
+
+
+@pytest.mark.parametrize(("lacking", "words"), [("query", "has no field"), ("to_canonical", "does not map")])
+def test_method_that_cannot_answer_for_its_surface_is_refused(
+    avatar, person, tmp_path, monkeypatch, lacking, words
+) -> None:
+    monkeypatch.setattr(type(avatar), lacking, getattr(Avatar, lacking))
+    with pytest.raises(TwofoldError, match=words):
+        export(avatar, person, tmp_path / "exports", ExportRequest(config=SMALL))
+    assert not (tmp_path / "exports").exists()
+
+
+def test_method_whose_density_is_no_canonical_one_is_refused(avatar, person, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(type(avatar), "level_space", "posed")
+    with pytest.raises(TwofoldError, match="no surface in canonical space"):
+        export(avatar, person, tmp_path / "exports", ExportRequest(config=SMALL))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from twofold.body.motion import Motion
 from twofold.capture.types import Capture
@@ -67,6 +68,16 @@ def require_exportable(request: ExportRequest, capture: Capture) -> None:
         raise TwofoldError(f"Exporting needs {' and '.join(missing)}; run pip install 'twofold[export]'.")
 
 
+@torch.no_grad()
+def _require_field(avatar: Avatar) -> None:
+    """Refuses methods whose surface cannot be asked for in canonical space, by the sentence of what they lack."""
+    if avatar.level_space != "canonical":
+        raise TwofoldError(f"{type(avatar).__name__} has no surface in canonical space to export; render it instead.")
+    posed = avatar.pose(torch.zeros(24, 3), torch.zeros(3))
+    x, matrix = avatar.to_canonical(posed.body.vertices[:1], posed)
+    avatar.query(x, posed, matrix)
+
+
 def missing_packages(config: BakeConfig) -> list[str]:
     """Packages of the extra `export` that baking needs and that are not installed."""
     needed = ["fast_simplification", *(["xatlas"] if config.texture else [])]
@@ -86,6 +97,7 @@ def export(
         TwofoldError: see `require_exportable`; the avatar has no surface; the disk refuses.
     """
     require_exportable(request, capture)
+    _require_field(avatar)
     with plain_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     start = time.monotonic()
