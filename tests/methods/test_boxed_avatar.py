@@ -27,12 +27,16 @@ def subject(person):
     return Subject.of(person)
 
 
+def density_of(avatar):
+    return getattr(avatar, "local", avatar).radiance.density
+
+
 @pytest.fixture(scope="module", params=NAMES)
 def avatar(request, subject):
     """With densities of a few tens per metre, so that rays are neither opaque at once nor clear."""
     avatar = CASES[request.param].method.build(subject, 0).eval()
     with torch.no_grad():
-        avatar.radiance.density.layers[-1].bias += 8
+        density_of(avatar).layers[-1].bias += 8
     return avatar
 
 
@@ -102,8 +106,6 @@ def importance_one_by_one(depths, weights, count):
 
 @torch.no_grad()
 def test_pixels_are_those_of_a_loop_over_samples(avatar, posed, rays):
-    if type(avatar).__name__ == "NpcAvatar":
-        pytest.skip("composites by another rule, see test_npc")
     settings = avatar.settings
     found = avatar.render(rays, posed, BACKGROUND)
     bounded, hit = avatar.bounded(rays, posed.own)
@@ -201,14 +203,14 @@ def test_points_away_from_the_body_are_empty_where_a_distance_is_set(subject, pe
 def test_a_surface_comes_out_near_the_body(avatar, person):
     posed = avatar.pose(person.train[1].pose, person.train[1].translation)
     with torch.no_grad():
-        avatar.radiance.density.layers[-1].bias += 30
+        density_of(avatar).layers[-1].bias += 30
         vertices, faces = posed_surface(avatar, posed, voxel=0.05)
-        avatar.radiance.density.layers[-1].bias -= 30
+        density_of(avatar).layers[-1].bias -= 30
     assert len(faces) > 100
     assert torch.cdist(vertices, posed.body.vertices).amin(1).max() < 0.3
 
 
-@pytest.mark.parametrize("name", ["pm_avatar_fast"])
+@pytest.mark.parametrize("name", ["pm_avatar_fast", "danbo_fast"])
 def test_an_interrupted_training_ends_with_the_same_numbers(name, person, tmp_path):
     start = CASES[name]
     training = replace(start.training, steps=4, checkpoint_every=2, preview_every=0, warmup=0)

@@ -38,7 +38,7 @@ def avatar(recipe, subject):
 def opaque(avatar):
     with torch.no_grad():
         if isinstance(avatar, BoxedAvatar):
-            avatar.radiance.density.layers[-1].bias += 30
+            getattr(avatar, "local", avatar).radiance.density.layers[-1].bias += 30
         else:
             avatar.raw_beta.fill_(0.02)
     return avatar.eval()

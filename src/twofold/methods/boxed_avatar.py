@@ -139,6 +139,8 @@ class BoxedAvatar(Avatar[BoxedPose[Shared]]):
     """An avatar with a box around each bone; what is inside, a method says."""
 
     rest_joints: Tensor
+    parts: tuple[int, ...] = tuple(range(24))
+    """Joints whose boxes rays are cut with."""
 
     def __init__(
         self, settings: BoxedSettings, pose_octaves: int, subject: Subject, generator: torch.Generator
@@ -282,7 +284,7 @@ class BoxedAvatar(Avatar[BoxedPose[Shared]]):
         """World rays in the root's space, between the ends of the boxes that they meet; and which are sampled."""
         rotation, shift = own.to_root[:3, :3], own.to_root[:3, 3]
         turned = Rays(rays.origins @ rotation.T + shift, rays.directions @ rotation.T, rays.near, rays.far)
-        boxed, hit = clip_to_bone_boxes(turned, own.to_frame, own.half_sizes)
+        boxed, hit = clip_to_bone_boxes(turned, own.to_frame[[*self.parts]], own.half_sizes[[*self.parts]])
         return self.missed(boxed, own, hit)
 
     def _shaded(self, rays: Rays, own: BoxedPose[Shared], noise: torch.Generator | None) -> Float[Tensor, "R k"]:
