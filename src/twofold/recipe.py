@@ -22,12 +22,14 @@ class PixelConfig:
     """Edge of a patch, pixels."""
     patch_on_subject: float = 0.9
     """Probability that a patch is centred on the subject."""
-    reachable: Literal["body", "box"] = "body"
+    reachable: Literal["body", "box", "image"] = "body"
     """Pixels beside the subject: "body", near the body or the mask; "box", all whose rays meet the box of the joints of
-    the pose as given, as released."""
+    the pose as given, as released; "image", all of the image, for methods that learn the background."""
     subject: Literal["half", "any"] = "half"
     """Pixels of the subject: "half", those that it covers by more than half, in their whole bounding box; "any", as
     released, those that it covers at all, in that box without its last row and column."""
+    between: bool = False
+    """Whether a single ray passes anywhere in its pixel's square, with colours interpolated between pixels."""
     replacement: bool = True
     """Whether the same single pixel may be drawn twice; the release draws without replacement."""
 

@@ -5,10 +5,13 @@ from dataclasses import replace
 from tiny_person import tiny_recipe
 
 from twofold.field.factorized import FactorizedFieldConfig
+from twofold.field.prefit import PrefitConfig
 from twofold.methods.factorized_recipes import ABLATIONS, ablation
 from twofold.methods.table import RECIPES
+from twofold.methods.vid2avatar import Vid2AvatarConfig
 from twofold.recipe import Recipe
 from twofold.sampling.error_bounded import ErrorBoundedSampler
+from twofold.sampling.shell_sampler import ShellSampler
 
 LATE = 20_006
 """A step at which every schedule has begun and, of five frames, no zero pose is shown."""
@@ -21,13 +24,12 @@ def shrunk(recipe: Recipe) -> Recipe:
     method = recipe.method
     if hasattr(method, "boxed"):
         return shrunk_boxed(recipe)
+    if isinstance(method, Vid2AvatarConfig):
+        return shrunk_vid2avatar(recipe, method)
     assert isinstance(method.field, FactorizedFieldConfig)
     # In float32, so that tolerances hold whatever the hardware is good at; `field` tests the other types.
     field = replace(method.field, width=72, high_sdf_depth=4, high_color_depth=2, hidden_dtype="float32")
-    if isinstance(method.sampler, ErrorBoundedSampler):
-        sampler = replace(method.sampler, refined=24, shaded=12, extra=6, rounds=2)
-    else:
-        sampler = replace(method.sampler, step=0.02, voxel=0.03)
+    sampler = shrunk_sampler(method.sampler)
     losses = replace(method.losses, eikonal_points=32)
     pixels = replace(recipe.training.pixels, rays=64, patches=1, patch_size=16)
     method = replace(method, field=field, sampler=sampler, losses=losses)
@@ -37,6 +39,29 @@ def shrunk(recipe: Recipe) -> Recipe:
 def shrunk_boxed(recipe: Recipe) -> Recipe:
     """PM-Avatar, DANBO and NPC with few samples; their networks are the whole ones."""
     method = replace(recipe.method, boxed=replace(recipe.method.boxed, coarse=12, fine=6, hidden_dtype="float32"))
+    pixels = replace(recipe.training.pixels, rays=64)
+    return replace(recipe, method=method, training=replace(recipe.training, pixels=pixels))
+
+
+def shrunk_sampler(sampler: ErrorBoundedSampler | ShellSampler) -> ErrorBoundedSampler | ShellSampler:
+    if isinstance(sampler, ErrorBoundedSampler):
+        return replace(sampler, refined=24, shaded=12, extra=6, rounds=2)
+    return replace(sampler, step=0.02, voxel=0.03)
+
+
+def shrunk_vid2avatar(recipe: Recipe, method: Vid2AvatarConfig) -> Recipe:
+    field = replace(method.field, width=56, sdf_depth=4, color_depth=2, skip_layer=2, hidden_dtype="float32")
+    scene = method.scene and replace(method.scene, width=120, depth=3, skip_layer=2, color_width=16, code_size=4)
+    method = replace(
+        method,
+        field=field,
+        scene=scene,
+        scene_samples=6,
+        sampler=shrunk_sampler(method.sampler),
+        losses=replace(method.losses, eikonal_points=32),
+        separation=replace(method.separation, surface_cells=32),
+        prefit=PrefitConfig(steps=5, points=32, pool=64),
+    )
     pixels = replace(recipe.training.pixels, rays=64)
     return replace(recipe, method=method, training=replace(recipe.training, pixels=pixels))
 

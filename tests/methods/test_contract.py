@@ -108,10 +108,11 @@ def test_rays_that_see_nobody_are_background_and_keep_a_gradient(avatar, posed, 
     found = avatar.render(away, posed, BACKGROUND, Mode(5), torch.Generator().manual_seed(0))
     assert (found.base is None) == (avatar.render(rays, posed, BACKGROUND).base is None)
     for part in (found, found.base or found):
-        torch.testing.assert_close(part.color, BACKGROUND.expand_as(part.color), rtol=0, atol=0)
-        assert not part.opacity.any()
+        # Samples of rays with bounds of a method's own may lie anywhere, where a density is small but not zero.
+        torch.testing.assert_close(part.color, BACKGROUND.expand_as(part.color), rtol=0, atol=1e-6)
+        assert part.opacity.max() < 1e-6
     found.color.sum().backward()
-    assert all(p.grad is None or not p.grad.any() for p in avatar.parameters())
+    assert all(p.grad is None or p.grad.abs().max() < 1e-4 for p in avatar.parameters())
     avatar.zero_grad(set_to_none=True)
 
 
@@ -131,7 +132,8 @@ def test_losses_are_finite_and_every_parameter_learns(name, subject, person):
     for which in (0, 3):
         generator = torch.Generator().manual_seed(which)
         frame, batch = person.train[which], source.draw(which, generator)
-        batch, mode = batch.against(torch.tensor(person.background)), Mode(LATE, LATE // 5)
+        behind = avatar.background(torch.tensor(person.background), len(batch.rays), generator)
+        batch, mode = batch.against(behind), Mode(LATE, LATE // 5)
         posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
         rendering = avatar.render(batch.rays, posed, batch.background, mode, generator)
         terms = avatar.losses(rendering, batch, posed, mode, generator)

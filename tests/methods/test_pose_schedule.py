@@ -26,6 +26,11 @@ def test_pose_is_zero_at_first_and_in_every_so_many_epochs_but_never_outside_of_
     assert seen(None, 0, **options).any()
 
 
+def test_pose_is_zero_before_an_epoch_however_long_it_is():
+    shown = [bool(seen(step, step // 7, zero_epochs=2).any()) for step in range(30)]
+    assert shown == [step >= 14 for step in range(30)]
+
+
 def test_pose_is_dropped_by_chance_as_often_as_asked_and_the_same_each_time():
     kept = [bool(seen(step, drop=0.2).any()) for step in range(1000)]
     assert 0.16 < 1 - sum(kept) / 1000 < 0.24

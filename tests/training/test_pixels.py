@@ -351,3 +351,34 @@ def test_ignored_pixels_of_a_patch_are_background_in_the_image_too(hidden):
     off = batch.patch_pixels < 0
     assert off.any()
     assert (batch.patch_color[off] == torch.tensor([0.1, 0.5, 0.9])).all()
+
+
+def test_pixels_of_the_whole_image_are_drawn_where_asked(hidden):
+    source = PixelSource(hidden.train, hidden.body, hidden.betas, PixelConfig(rays=9000, reachable="image", patches=0))
+    rows, columns = pixels_of(hidden, source.draw(1, torch.Generator().manual_seed(0)))
+    seen = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    seen[rows, columns] = True
+    assert seen[~hidden.train[1].ignored()].float().mean() > 0.7
+    assert not seen[hidden.train[1].ignored()].any()
+
+
+def test_rays_between_pixels_have_colours_between_theirs(hidden):
+    """By the plain formula of bilinear interpolation, at places that lie in the squares of the pixels drawn."""
+    config = PixelConfig(rays=200, reachable="image", patches=0)
+    plain, between = (
+        PixelSource(hidden.train, hidden.body, hidden.betas, replace(config, between=on)).draw(
+            0, torch.Generator().manual_seed(0)
+        )
+        for on in (False, True)
+    )
+    camera, image = hidden.train[0].camera, (hidden.train[0].image() * 255).round() / 255
+    place = project(camera, between.rays.origins + 3 * between.rays.directions)[0]
+    pixel = project(camera, plain.rays.origins + 3 * plain.rays.directions)[0]
+    assert (place - pixel).abs().max() < 0.5 + 1e-3
+    assert (place - pixel).abs().mean() > 0.15
+    for (column, row), color in zip(place.tolist(), between.image, strict=True):
+        left, top = min(int(column), WIDTH - 2), min(int(row), HEIGHT - 2)
+        u, v = column - left, row - top
+        upper = (1 - u) * image[top, left] + u * image[top, left + 1]
+        lower = (1 - u) * image[top + 1, left] + u * image[top + 1, left + 1]
+        torch.testing.assert_close(color, (1 - v) * upper + v * lower, rtol=0, atol=2e-3)

@@ -281,6 +281,13 @@ class Avatar(nn.Module, ABC, Generic[Own]):
         """The stages of a training, one after the other; most methods have one."""
         return (Stage("train", training),)
 
+    def check_capture(self, capture: Capture) -> None:
+        """Called with the capture of a new training before anything is written.
+
+        Raises:
+            TwofoldError: the capture lacks what the method needs.
+        """
+
     def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
         """Called once before a stage's first step: pre-fits, key frames. What it makes is part of the state.
 

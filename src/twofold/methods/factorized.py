@@ -1,96 +1,39 @@
 """The paper's method: an avatar whose field has a pose-independent and a pose-dependent branch."""
 
 import dataclasses
-import functools
-import math
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
-from torch.nn import functional as F
+from torch import Tensor
 
-from twofold.body.skeleton import PosedBody, ShapedBody, pose_body, shape_body
-from twofold.config import require, require_within
-from twofold.deform.pose_refinement import PoseRefinement
-from twofold.deform.skinning import normal_matrices, to_canonical, vertex_transforms, weights_by
-from twofold.field.factorized import FactorizedFieldConfig
-from twofold.field.factorized_grid import GridFieldConfig
+from twofold.config import require
+from twofold.field.factorized import FactorizedField, FactorizedFieldConfig
+from twofold.field.factorized_grid import GridField, GridFieldConfig
 from twofold.field.output import FieldOutput
-from twofold.geometry.cameras import Rays
-from twofold.geometry.surfaces import nearest_vertices
 from twofold.kernels.runtime import compiled_methods
-from twofold.losses import MOST_STEPS, LossConfig
-from twofold.methods.base import (
-    EVALUATION,
-    Avatar,
-    Batch,
-    MethodConfig,
-    Mode,
-    ParameterGroup,
-    PosedAvatar,
-    Rendering,
-)
-from twofold.methods.factorized_config import FactorizedPose, RateConfig
-from twofold.methods.loss_terms import loss_terms
-from twofold.methods.pose_schedule import PoseConfig, condition
+from twofold.methods.base import ParameterGroup
+from twofold.methods.factorized_config import RateConfig
+from twofold.methods.skinned import Posed, SkinnedAvatar
+from twofold.methods.skinned_config import SkinnedConfig
 from twofold.methods.subject import Subject
-from twofold.metrics.perceptual import LPIPS
-from twofold.sampling.error_bounded import ErrorBoundedSampler
-from twofold.sampling.placement import Deformation, FieldQuery, Placement, Sampler
-from twofold.sampling.posed_surface import PosedSurface
-from twofold.sampling.shell import Shell
 from twofold.sampling.shell_sampler import ShellSampler
-from twofold.volume.rendering import composite, composite_weights, laplace_density
-from twofold.volume.samples import Samples
 
 
 @dataclass(frozen=True)
-class FactorizedConfig(MethodConfig):
+class FactorizedConfig(SkinnedConfig):
     """The factorized avatar; the defaults are the authors' release."""
 
     field: FactorizedFieldConfig | GridFieldConfig = dataclasses.field(default_factory=FactorizedFieldConfig)
-    sampler: ErrorBoundedSampler | ShellSampler = dataclasses.field(default_factory=ShellSampler)
-    losses: LossConfig = dataclasses.field(default_factory=LossConfig)
-    pose: PoseConfig = dataclasses.field(default_factory=PoseConfig)
     rates: RateConfig = dataclasses.field(default_factory=RateConfig)
-    neighbours: int = 1
-    """How many nearest vertices give a point its skinning weights."""
-    late_neighbours: int | None = None
-    """The same in training from epoch `late_from` on; 7 in the release, whose validation changes it."""
-    late_from: int = 100
-    """Epochs before that; every so many epochs the canonical body that turns normals follows the corrected shape."""
-    falloff: Literal["exponential", "scene", "smooth"] = "exponential"
-    """How these count by distance: "exponential", nearly alike in metres; "scene", so in scene units, as released;
-    "smooth", down to nothing at the last of them, so that points beside each other move alike."""
-    normals_by: Literal["posed", "canonical"] = "posed"
-    """Whose nearest vertices turn normals: "posed", those that moved the sample; "canonical", as released."""
-    beta: float = 0.1
-    """Initial scale of the density, metres."""
-    beta_floor: float = 1e-4
-    """Least scale of the density, metres."""
-    beta_form: Literal["softplus", "absolute"] = "softplus"
-    """How the scale is kept positive; "absolute" is the release's |beta|, which can stall at zero."""
-    outlier_distance: float = 0.1
-    """Points further than this from the body, metres, count as empty."""
-    outliers_in_shading: bool = True
-    """Whether that also holds for the colours; the release forgets it there."""
-    scene_scale: Literal["metres", "released"] = "metres"
-    """"released" measures lengths along rays and outliers in the release's normalised scene units."""
-    shell_refresh: int = 500
-    """Steps after which the shells follow the corrected poses."""
     background: Literal["capture", "random"] = "capture"
     """What training images are composited on: the capture's background, or a random colour at each step."""
 
     def __post_init__(self) -> None:
         """Refuses options that exclude each other."""
-        require_within(
-            self, neighbours=(1, 64), late_neighbours=(1, 64), late_from=(1, MOST_STEPS),
-            shell_refresh=(1, MOST_STEPS), outlier_distance=(0.001, 10), beta=(0, 10),
-        )  # fmt: skip
-        require(0 < self.beta_floor < self.beta, f"beta_floor should lie between 0 and beta={self.beta}")
+        super().__post_init__()
         if isinstance(self.field, GridFieldConfig) and isinstance(self.sampler, ShellSampler):
             within = self.sampler.radius <= self.field.radius
             require(within, f"sampler.radius should be at most field.radius={self.field.radius}, where features end")
@@ -100,73 +43,20 @@ class FactorizedConfig(MethodConfig):
         return FactorizedAvatar(self, subject, seed)
 
 
-Posed = PosedAvatar[FactorizedPose]
-
-
-class FactorizedAvatar(Avatar[FactorizedPose]):
+class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridField]):
     """See `FactorizedConfig`."""
-
-    shell_poses: Tensor
-    shell_translations: Tensor
-    shell_shape: Tensor
-    canonical_points: Tensor
-    late_shape: Tensor
-    rest_joints: Tensor
 
     def __init__(self, config: FactorizedConfig, subject: Subject, seed: int) -> None:
         """Builds the field around the subject's canonical body."""
-        super().__init__()
-        self.config, self.subject = config, subject
-        generator = torch.Generator().manual_seed(seed)
-        self.refinement = PoseRefinement(subject.times, len(subject.betas), tuple(config.pose.refine))
-        given = shape_body(subject.body, subject.betas)
-        canonical = pose_body(given, subject.poses[0], subject.translations[0])
-        self.register_buffer("rest_joints", given.joints.clone(), persistent=False)
-        pose_size = 72 if config.pose.with_root else 69
-        self.field = config.field.build(canonical, pose_size, generator)
-        start = config.beta - config.beta_floor
-        # Softplus with this sharpness is nearly linear at the start, yet never reaches zero.
-        raw = start if config.beta_form == "absolute" else math.log(math.expm1(start / _BETA_UNIT)) * _BETA_UNIT
-        self.raw_beta = nn.Parameter(torch.tensor(float(raw)))
-        self.scale = subject.scene_scale if config.scene_scale == "released" else 1.0
-        # Shells are made of poses and shape as they were at the last refresh; kept so that a resumed run repeats them.
-        self.register_buffer("shell_poses", subject.poses.clone())
-        self.register_buffer("shell_translations", subject.translations.clone())
-        self.register_buffer("shell_shape", torch.zeros_like(subject.betas))
-        self.register_buffer("canonical_points", canonical.canonical_vertices.clone(), persistent=False)
-        if config.late_neighbours is not None:
-            self.register_buffer("late_shape", torch.zeros_like(subject.betas))
-        self._shells: dict[int, Shell] = {}
-        self._bodies = {torch.device("cpu"): subject.body}
-        self._perceptual: tuple[LPIPS, ...] = ()
-        weigh = functools.partial(weights_by, config.falloff, scale=self.scale)
-        self.deformation = Deformation(weigh, config.outlier_distance / self.scale, self.scale)
-        self._sampler: Sampler = config.sampler.build(self.deformation, canonical.canonical_vertices, canonical.faces)
+        super().__init__(config, subject, seed, config.field.build)
 
     @property
-    def wants_perceptual(self) -> bool:
-        """See `Avatar.wants_perceptual`."""
-        return self.config.losses.lpips > 0
-
-    def attach_perceptual(self, network: LPIPS | None) -> None:
-        """See `Avatar.attach_perceptual`; it is not moved with the avatar either."""
-        self._perceptual = (network.to(self.device),) if network else ()
+    def _dense(self) -> bool:
+        return self.field.dense
 
     @property
-    def ray_margin(self) -> float:
-        """See `Avatar.ray_margin`."""
-        return self.config.sampler.reach + 0.02
-
-    def scalars(self) -> dict[str, float]:
-        """See `Avatar.scalars`: the scale of the density."""
-        return {"beta": float(self.beta.detach())}
-
-    @property
-    def beta(self) -> Float[Tensor, ""]:
-        """Scale of the density, metres."""
-        if self.config.beta_form == "absolute":
-            return self.raw_beta.abs() + self.config.beta_floor
-        return F.softplus(self.raw_beta / _BETA_UNIT) * _BETA_UNIT + self.config.beta_floor
+    def _two_branches(self) -> bool:
+        return self.config.field.branches in ("both", "high_rendered")
 
     def compiled(self) -> AbstractContextManager[bool]:
         """See `Avatar.compiled`. Feature grids have compiled loops of their own."""
@@ -186,182 +76,6 @@ class FactorizedAvatar(Avatar[FactorizedPose]):
             return color
         return torch.rand(3, generator=generator, device=generator.device).to(color)
 
-    def before_step(self, mode: Mode) -> None:
-        """Lets the shells, and the canonical body that turns normals, follow the corrections from time to time."""
-        epoch, first = self._epoch(mode)
-        if self.config.late_neighbours is not None and first and epoch and epoch % self.config.late_from == 0:
-            self.late_shape.copy_(self.refinement.shape.detach())
-        refresh, step = self.config.shell_refresh, mode.step or 0
-        if not self.refinement.parts or step == 0 or step % refresh or step < self.config.pose.refine_from:
-            return
-        with torch.no_grad():
-            for row, time in enumerate(self.subject.times):
-                pose, translation = self.subject.poses[row], self.subject.translations[row]
-                pose, translation = self.refinement(int(time), pose.to(self.device), translation.to(self.device))
-                self.shell_poses[row], self.shell_translations[row] = pose, translation
-            self.shell_shape.copy_(self.refinement.shape)
-        self._shells.clear()
-
-    def pose(
-        self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], frame_index: int | None = None,
-        mode: Mode = EVALUATION,
-    ) -> Posed:  # fmt: skip
-        """See `Avatar.pose`. While training, a frame's shell is reused until the next refresh."""
-        pose, translation = pose.to(self.device), translation.to(self.device)
-        config, data = self.config, (pose, translation)
-        refining = mode.step is not None and mode.step >= config.pose.refine_from
-        if frame_index is not None:
-            with torch.set_grad_enabled(torch.is_grad_enabled() and refining):
-                pose, translation = self.refinement(frame_index, pose, translation)
-        with torch.set_grad_enabled(torch.is_grad_enabled() and refining and bool(self.refinement.parts)):
-            refined = mode.training or frame_index is not None or config.pose.test_shape == "refined"
-            shaped = self._shape(self.refinement.shape if refined else None)
-            rest_joints = self.rest_joints if config.pose.canonical_shape == "given" else None
-            body = pose_body(shaped, pose, translation, rest_joints)
-            forward = vertex_transforms(body)
-
-        def given() -> Tensor:
-            return pose_body(self._shape(None), *data).joints
-
-        box = config.sampler.ray_box(body.joints, given, self.subject.scene_scale)
-        epoch, _ = self._epoch(mode)
-        late = mode.training and config.late_neighbours is not None and epoch >= config.late_from
-        neighbours = (config.late_neighbours if late else None) or config.neighbours
-        seen = condition(config.pose, pose, mode.step, epoch)
-        surface = PosedSurface(body, forward, self._shell(body, frame_index, mode), box, neighbours)
-        return PosedAvatar(body, FactorizedPose(surface, seen, self._anchors(mode)))
-
-    def _shape(self, change: Tensor | None) -> ShapedBody:
-        """The body, its shape corrected by so much or as it was given."""
-        body = self.subject.body
-        if self.device not in self._bodies:
-            tensors = {n: t.to(self.device) for n, t in vars(body).items() if isinstance(t, Tensor)}
-            self._bodies[self.device] = type(body)(name=body.name, **tensors)
-        betas = self.subject.betas.to(self.device)
-        return shape_body(self._bodies[self.device], betas if change is None else betas + change)
-
-    def _epoch(self, mode: Mode) -> tuple[int, bool]:
-        """The epoch of a training step, and whether it begins there, as `PoseConfig.epochs` counts them."""
-        if self.config.pose.epochs == "training":
-            return mode.epoch, mode.starts_epoch
-        epoch, within = divmod(mode.step or 0, len(self.subject.times))
-        return epoch, within == 0
-
-    def _anchors(self, mode: Mode) -> Tensor | None:
-        """Canonical vertices that turn normals, or None where those do that mapped the sample."""
-        if self.config.normals_by == "posed":
-            return None
-        if not mode.training or self.config.late_neighbours is None or not self.late_shape.any():
-            return self.canonical_points
-        rest = torch.zeros(24, 3, device=self.device)
-        return pose_body(self._shape(self.late_shape), rest, rest[0]).canonical_vertices
-
-    def _normal_matrices(self, x_canonical: Tensor, by_posed: Tensor, posed: Posed) -> Tensor:
-        """What turns canonical gradients into observation space: that of the mapping, or of the nearest anchors."""
-        own = posed.own
-        if own.anchors is None:
-            return by_posed
-        away, nearest = nearest_vertices(x_canonical, own.anchors, own.surface.neighbours)
-        # Canonical space is in metres, in the release too.
-        return normal_matrices(nearest, weights_by(self.config.falloff, away.square()), own.surface.forward)
-
-    def _shell(self, body: PosedBody, frame_index: int | None, mode: Mode) -> Shell:
-        sampler, neighbours = self.config.sampler, max(self.config.neighbours, self.config.late_neighbours or 1)
-        row = self.refinement.rows.get(frame_index) if mode.training and frame_index is not None else None
-        if row is None:
-            return sampler.shell(body.vertices, body.faces, neighbours)
-        if row not in self._shells:
-            with torch.no_grad():
-                shaped = self._shape(self.shell_shape)
-                start = pose_body(shaped, self.shell_poses[row], self.shell_translations[row])
-            self._shells[row] = sampler.shell(start.vertices, body.faces, neighbours)
-        return self._shells[row]
-
-    def render(
-        self, rays: Rays, posed: Posed, background: Float[Tensor, "*r 3"] | None, mode: Mode = EVALUATION,
-        generator: torch.Generator | None = None,
-    ) -> Rendering:  # fmt: skip
-        """See `Avatar.render`."""
-        behind = torch.zeros(3, device=self.device) if background is None else background
-        placed = self.place(rays, posed, mode, generator)
-        if len(placed.samples) == 0:
-            return self._nothing(len(rays), behind)
-        samples, outlier = placed.samples, placed.outlier
-        x_canonical, by_posed = placed.differentiable(posed.own.surface)
-        to_observation = self._normal_matrices(x_canonical, by_posed, posed)
-        answer = self.field(x_canonical, posed.own.condition, to_observation)
-        normals = F.normalize((to_observation * answer.gradient[:, None]).sum(-1), dim=-1, eps=1e-6)
-        whole = self._composite(answer, normals, samples, outlier, behind, len(rays))
-        if answer.base is None:
-            return whole
-        # The base rendering's normals are its own branch's, at the same samples.
-        base_normals = F.normalize((to_observation * answer.base.gradient[:, None]).sum(-1), dim=-1, eps=1e-6)
-        return replace(whole, base=self._composite(answer.base, base_normals, samples, outlier, behind, len(rays)))
-
-    def place(self, rays: Rays, posed: Posed, mode: Mode, generator: torch.Generator | None) -> Placement:
-        """The samples that `render` shades."""
-
-        def distance(x_canonical: Tensor) -> Tensor:
-            return self.field.sdf(x_canonical, posed.own.condition)
-
-        version = tuple(parameter._version for parameter in self.field.parameters())
-        query = FieldQuery(distance, self.beta, self.field.dense, version)
-        placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
-        shading = self.config.outliers_in_shading and not mode.training
-        return placed if shading else replace(placed, outlier=torch.zeros_like(placed.outlier))
-
-    def _composite(
-        self, answer: FieldOutput, normals: Tensor, samples: Samples, outlier: Tensor, background: Tensor, rays: int
-    ) -> Rendering:
-        sdf = torch.where(outlier, 4.0, answer.sdf)
-        scaled = Samples(samples.ray_index, samples.depth, samples.delta * self.scale)
-        weights = composite_weights(laplace_density(sdf, self.beta), scaled)
-        ones = torch.ones_like(sdf)[:, None]
-        values = torch.cat([answer.color, ones, samples.depth[:, None], normals.detach()], -1)
-        out = composite(weights, values, samples, rays)
-        opacity = out[:, 3]
-        depth = out[:, 4] / opacity.detach().clamp_min(1e-6)
-        return Rendering(out[:, :3] + (1 - opacity[:, None]) * background, opacity, depth, out[:, 5:8])
-
-    def _nothing(self, rays: int, background: Tensor) -> Rendering:
-        # Tied to a parameter, so that a step whose rays all miss has a gradient, of zero, like any other.
-        zero = (0 * self.beta).expand(rays)
-        empty = Rendering(background + zero[:, None], zero, zero, zero[:, None].expand(rays, 3))
-        two = self.config.field.branches in ("both", "high_rendered")
-        return replace(empty, base=empty if two else None)
-
-    def losses(
-        self, rendering: Rendering, batch: Batch, posed: Posed, mode: Mode, generator: torch.Generator
-    ) -> dict[str, Float[Tensor, ""]]:
-        """See `Avatar.losses`."""
-
-        def gradients(x_canonical: Tensor) -> Tensor:
-            return self.field.distance_and_gradient(x_canonical, posed.own.condition)[1]
-
-        network = self._perceptual[0] if self._perceptual else None
-        config, vertices = self.config.losses, self.canonical_points
-        return loss_terms(config, rendering, batch, vertices, gradients, network, mode.step or 0, generator)
-
-    def level(self, x: Float[Tensor, "S 3"], posed: Posed, branch: str = "full") -> Float[Tensor, "S"]:
-        """See `Avatar.level`."""
-        require(branch in ("full", "base"), f'branch is "full" or "base"; it is {branch!r}')
-        if branch == "full":
-            return self.field.sdf(x, posed.own.condition)
-        return self.query(x, posed, branch=branch).sdf
-
-    def refined_pose(
-        self, frame_index: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], max_gap: float
-    ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
-        """See `Avatar.refined_pose`."""
-        with torch.no_grad():
-            return self.refinement.at(
-                frame_index, pose.to(self.device), translation.to(self.device), self.subject, max_gap
-            )
-
-    def pose_corrections(self) -> dict[str, float]:
-        """See `Avatar.pose_corrections`."""
-        return self.refinement.change() if self.refinement.parts else {}
-
     @property
     def separates_light(self) -> bool:
         """See `Avatar.separates_light`."""
@@ -378,17 +92,3 @@ class FactorizedAvatar(Avatar[FactorizedPose]):
         else:
             answer = self.field(x_canonical, posed.own.condition, to_observation)
         return answer if branch == "full" else answer.base or answer
-
-    def to_canonical(
-        self, x_posed: Float[Tensor, "S 3"], posed: Posed
-    ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 3"]]:
-        """See `Avatar.to_canonical`; the nearest vertices are exact, `render` takes them from the shell's lists."""
-        surface = posed.own.surface
-        distances, nearest = nearest_vertices(x_posed, posed.body.vertices, surface.neighbours)
-        weights = self.deformation.weigh(distances.square())
-        x_canonical, by_posed = to_canonical(x_posed, nearest, weights, surface.forward)
-        return x_canonical, self._normal_matrices(x_canonical, by_posed, posed)
-
-
-_BETA_UNIT = 0.01
-"""Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""

@@ -1,12 +1,8 @@
-"""Small parts of the factorized method: learning rates, and what it derives from a pose."""
+"""Learning rates of the factorized method."""
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
-from torch import Tensor
-
 from twofold.config import require_within
-from twofold.sampling.posed_surface import PosedSurface
 
 
 @dataclass(frozen=True)
@@ -27,18 +23,3 @@ class RateConfig:
     def __post_init__(self) -> None:
         """Refuses rates that diverge at once."""
         require_within(self, **dict.fromkeys(vars(self), (0, 1000)))
-
-
-@dataclass(frozen=True)
-class FactorizedPose:
-    """What the method derives from a pose.
-
-    Attributes:
-        surface: the posed body with its shell.
-        condition: the pose vector that the pose-dependent branch is conditioned on.
-        anchors: canonical vertices that turn normals, where these are not the ones that inverse skinning found.
-    """
-
-    surface: PosedSurface
-    condition: Float[Tensor, "P"]
-    anchors: Float[Tensor, "V 3"] | None = None

@@ -21,6 +21,8 @@ class PoseConfig:
     """Whether the global orientation is part of it."""
     zero_until: int = 10_000
     """The branch sees a zero pose before this step."""
+    zero_epochs: int = 0
+    """And before this epoch."""
     zero_every: int = 50
     """Afterwards it sees a zero pose during every epoch (a step a frame) whose number this divides; 0 for never."""
     drop: float = 0.0
@@ -38,7 +40,7 @@ class PoseConfig:
     def __post_init__(self) -> None:
         """Refuses chances and steps that there are not."""
         steps = (0, MOST_STEPS)
-        require_within(self, zero_until=steps, zero_every=steps, drop=(0, 1), refine_from=steps)
+        require_within(self, zero_until=steps, zero_epochs=steps, zero_every=steps, drop=(0, 1), refine_from=steps)
 
 
 def condition(config: PoseConfig, pose: Float[Tensor, "24 3"], step: int | None, epoch: int) -> Float[Tensor, "P"]:
@@ -56,7 +58,8 @@ def condition(config: PoseConfig, pose: Float[Tensor, "24 3"], step: int | None,
     if step is None:
         return seen
     dropped = _hash01(step) < config.drop
-    if step < config.zero_until or dropped or (config.zero_every and epoch % config.zero_every == 0):
+    early = step < config.zero_until or epoch < config.zero_epochs
+    if early or dropped or (config.zero_every and epoch % config.zero_every == 0):
         return torch.zeros_like(seen)
     return seen
 

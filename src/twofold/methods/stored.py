@@ -5,13 +5,13 @@ from typing import cast
 ABSENT: dict[str, dict[str, object]] = {
     "method": {"late_neighbours": None, "late_from": 100, "normals_by": "posed", "background": "capture"},
     "method.sampler": {"units": "metres", "box": "posed"},
-    "method.pose": {"epochs": "moments", "canonical_shape": "refined", "test_shape": "refined"},
+    "method.pose": {"zero_epochs": 0, "epochs": "moments", "canonical_shape": "refined", "test_shape": "refined"},
     "method.losses": {
         "lpips_dropout": 0.0, "lpips_off_box": "black", "s3im_center": 1.5, "eikonal_replacement": True,
         "base_mask": 0.0,
     },
     "training": {"epochs": "images"},
-    "training.pixels": {"reachable": "body", "subject": "half", "replacement": True},
+    "training.pixels": {"reachable": "body", "subject": "half", "between": False, "replacement": True},
 }  # fmt: skip
 """By the place in a recipe, what was done before a setting existed. A new recipe stores all of its settings, so a
 default may change and a run still means the same."""

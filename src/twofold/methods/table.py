@@ -8,12 +8,13 @@ from typing import Any, cast
 from twofold.config import KIND, from_dict, to_dict, with_overrides
 from twofold.errors import TwofoldError
 from twofold.inputs import shown
-from twofold.methods import danbo, factorized_recipes, pm_avatar
+from twofold.methods import danbo, factorized_recipes, pm_avatar, vid2avatar_recipes
 from twofold.methods.base import MethodConfig
 from twofold.methods.danbo import DanboConfig
 from twofold.methods.factorized import FactorizedConfig
 from twofold.methods.pm_avatar import PmAvatarConfig
 from twofold.methods.stored import completed
+from twofold.methods.vid2avatar import Vid2AvatarConfig
 from twofold.recipe import Recipe, TrainingConfig
 
 
@@ -29,6 +30,7 @@ METHODS: dict[str, Method] = {
     "factorized": Method(FactorizedConfig, factorized_recipes.RECIPES),
     "danbo": Method(DanboConfig, danbo.RECIPES),
     "pm_avatar": Method(PmAvatarConfig, pm_avatar.RECIPES),
+    "vid2avatar": Method(Vid2AvatarConfig, vid2avatar_recipes.RECIPES),
 }
 """Every method by its name. A recipe stored without a kind is of the first."""
 

@@ -142,7 +142,8 @@ class ErrorBoundedSampler:
         units: of the rays that it is given by a method: "metres", or "scene", as released, the units of a normalised
             scene, in which lengths on rays meet signed distances in metres.
         box: of the rays' near and far: "posed", 0.31 m around the joints of the corrected pose; "given", as released,
-            0.3 m and 0.01 scene units around those of the pose as given, with tiny components of directions replaced.
+            0.3 m and 0.01 scene units around those of the pose as given, with tiny components of directions replaced;
+            "rays", none: the near and far that the rays have.
         per_ray_stop: a ray within the tolerance is refined no more; otherwise, as released, all go on until all are.
     """
 
@@ -154,7 +155,7 @@ class ErrorBoundedSampler:
     rounds: int = 5
     ends: Literal["released", "ray"] = "released"
     units: Literal["metres", "scene"] = "metres"
-    box: Literal["posed", "given"] = "posed"
+    box: Literal["posed", "given", "rays"] = "posed"
     per_ray_stop: bool = False
 
     def __post_init__(self) -> None:
@@ -184,7 +185,7 @@ class ErrorBoundedSampler:
             given: those of the pose as given.
             scale: scene units to a metre.
         """
-        return joint_box(joints) if self.box == "posed" else joint_box(given(), scale)
+        return joint_box(given(), scale) if self.box == "given" else joint_box(joints)
 
     def build(
         self, deformation: Deformation, canonical: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
@@ -362,7 +363,8 @@ class ErrorBoundedPlacer:
         deformation, k = self.deformation, surface.neighbours
         scale = deformation.scale if self.config.units == "scene" else 1.0
         rays = without_tiny_components(rays) if self.config.box == "given" else rays
-        clipped, hit = clip_to_box(rays, *surface.box)
+        whole = self.config.box == "rays"
+        clipped, hit = (rays, rays.far > rays.near) if whole else clip_to_box(rays, *surface.box)
         inside = hit.nonzero()[:, 0]
         seen = clipped[inside]
         seen = Rays(seen.origins * scale, seen.directions, seen.near * scale, seen.far * scale)

@@ -193,6 +193,8 @@ def train(
         if not resume and team.leads:
             require_free(folder)
         avatar = recipe.method.build(subject, recipe.seed).to(device)
+        if not resume:
+            avatar.check_capture(capture)
         first = before_first(avatar) if before_first else None
         notes = [first] if first else []
         if wants_compiling(config, device):

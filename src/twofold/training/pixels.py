@@ -33,6 +33,19 @@ class _Picture:
         """Share of flat pixels that the person covers, 0..1."""
         return self.mask.flatten()[index].float() / 255
 
+    def between(self, position: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+        """Colour and coverage at places (column, row) between the middles of pixels, bilinearly interpolated."""
+        height, width = self.inside.shape
+        low = position.floor().minimum(torch.tensor([max(width - 2, 0), max(height - 2, 0)])).clamp_min(0)
+        part, (column, row) = position - low, low.long().unbind(-1)
+        color, coverage = torch.zeros(len(position), 3), torch.zeros(len(position))
+        for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            index = (row + down).clamp_max(height - 1) * width + (column + right).clamp_max(width - 1)
+            weight = (part[:, 0] if right else 1 - part[:, 0]) * (part[:, 1] if down else 1 - part[:, 1])
+            color = color + weight[:, None] * self.colors(index)
+            coverage = coverage + weight * self.coverage(index)
+        return color, coverage
+
 
 class PixelSource:
     """Draws batches from frames; images are read once and kept as bytes."""
@@ -76,7 +89,7 @@ class PixelSource:
                 "leave the image out of the training frames."
             )
         body = pose_body(self._shaped, frame.pose, frame.translation)
-        near = self._near_body if self.config.reachable == "body" else self._in_box
+        near = {"body": self._near_body, "box": self._in_box, "image": self._anywhere}[self.config.reachable]
         reachable = near(frame, body, inside)
         if self.config.surroundings is None:
             rows, columns = inside.any(1).nonzero()[:, 0], inside.any(0).nonzero()[:, 0]
@@ -122,6 +135,10 @@ class PixelSource:
         rays = without_tiny_components(pixel_rays(frame.camera, pixel_grid(frame.camera)))
         return clip_to_box(rays, body.joints.amin(0) - self.box_margin, body.joints.amax(0) + self.box_margin)[1]
 
+    def _anywhere(self, frame: Frame, body: PosedBody, inside: Tensor) -> Tensor:
+        """All pixels."""
+        return torch.ones_like(inside)
+
     def draw(self, which: int, generator: torch.Generator, device: torch.device | str = "cpu") -> Batch:
         """A batch from frame number `which`; the generator decides everything."""
         picture, config = self.picture(which), self.config
@@ -147,11 +164,20 @@ class PixelSource:
             used += len(rays)
         index = torch.cat(chosen)
         position = torch.stack([index % width, index // width], -1).float()
+        image, mask = picture.colors(index), picture.coverage(index)
+        if config.between:
+            moved = position[: config.rays] + torch.rand(config.rays, 2, generator=generator) - 0.5
+            moved = moved.clamp_min(0).minimum(torch.tensor([width - 1.0, height - 1.0]))
+            position = torch.cat([moved, position[config.rays :]])
+            between = picture.between(moved)
+            image, mask = (
+                torch.cat([first, rest[config.rays :]]) for first, rest in zip(between, (image, mask), strict=True)
+            )
         rays = pixel_rays(self.frames[which].camera, position)
         return Batch(
             rays=Rays(*(t.to(device) for t in (rays.origins, rays.directions, rays.near, rays.far))),
-            image=picture.colors(index).to(device),
-            mask=picture.coverage(index).to(device),
+            image=image.to(device),
+            mask=mask.to(device),
             singles=config.rays,
             patch_pixels=patches.to(device),
             patch_image=patch_image.to(device),

@@ -11,12 +11,12 @@ from twofold.body.skeleton import PosedBody
 from twofold.capture.types import spread
 from twofold.config import require_within
 from twofold.errors import TwofoldError
+from twofold.geometry.isosurface import extract_surface, keep_largest
 from twofold.geometry.surfaces import face_areas
 from twofold.methods.base import Avatar, PosedAvatar
 from twofold.outputs.export.morphs import PulledBack, Skin, bounded_weights, fit_morphs, morph_errors, pull_back
 from twofold.outputs.export.repair import as_tensors, decimate, is_watertight, solid
 from twofold.outputs.export.rig import to_rest, transfer_weights
-from twofold.outputs.mesh import extract_surface, keep_largest
 
 Progress = Callable[[float, str], None]
 
