@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
 
 from twofold.errors import TwofoldError
 from twofold.metrics.image import (
@@ -43,6 +44,60 @@ def test_ssim_equals_scikit_image(noise: float, data_range: float) -> None:
     image, truth = pair(1, noise=noise)
     theirs = structural_similarity(as_stored(truth), as_stored(image), data_range=data_range, channel_axis=-1)
     assert ssim(image, truth, data_range) == pytest.approx(float(theirs), abs=1e-9)
+
+
+@pytest.mark.parametrize("data_range", [1.0, 2.0])
+def test_ssim_under_the_gaussian_window_equals_scikit_image_and_torchmetrics(data_range: float) -> None:
+    image, truth = pair(1, noise=0.1)
+    found = ssim(image, truth, data_range, window="gaussian")
+    skimage = structural_similarity(
+        as_stored(truth), as_stored(image), data_range=data_range, channel_axis=-1, gaussian_weights=True,
+        use_sample_covariance=False,
+    )  # fmt: skip
+    assert found == pytest.approx(float(skimage), abs=1e-9)
+    x, y = (torch.from_numpy(as_stored(p)).movedim(-1, 0)[None] for p in (image, truth))
+    # Its mean takes in windows that hang over the edge, so this is its map without them.
+    _, full = structural_similarity_index_measure(x, y, data_range=data_range, return_full_image=True)
+    assert found == pytest.approx(full[..., 5:-5, 5:-5].mean().item(), abs=1e-6)
+
+
+def test_ssim_inside_a_mask_is_the_mean_of_scikit_images_map_there() -> None:
+    image, truth = pair(8)
+    mask = torch.zeros(40, 33, dtype=torch.bool)
+    mask[5:30, 3:17] = True
+    _, full = structural_similarity(as_stored(truth), as_stored(image), data_range=1.0, channel_axis=-1, full=True)
+    assert ssim(image, truth, inside=mask) == pytest.approx(full[mask.numpy()].mean(), abs=1e-9)
+    assert ssim(image, truth, inside=mask) != pytest.approx(ssim(image, truth), abs=1e-4)
+
+
+@given(st.integers(0, 50))
+def test_truncation_is_what_programs_of_the_field_store(seed: int) -> None:
+    image, truth = pair(seed, 9, 10)
+    stored = [(255 * np.clip(p.numpy(), 0, 1)).astype(np.uint8) for p in (image, truth)]
+    assert (to_8bit(image, truncate=True).numpy() == stored[0]).all()
+    theirs = peak_signal_noise_ratio(stored[1] / 255, stored[0] / 255, data_range=1.0)
+    assert psnr(image, truth, truncate=True) == pytest.approx(theirs, abs=1e-9)
+    similar = structural_similarity(stored[1] / 255, stored[0] / 255, data_range=2.0, channel_axis=-1)
+    assert ssim(image, truth, 2.0, truncate=True) == pytest.approx(float(similar), abs=1e-9)
+    assert (to_8bit(image, truncate=True) <= to_8bit(image)).all()
+
+
+def test_a_photograph_is_the_same_truncated_and_rounded() -> None:
+    every = (np.arange(256).astype(np.float32) / 255).reshape(16, 16)
+    assert (to_8bit(torch.from_numpy(every), truncate=True).flatten() == torch.arange(256)).all()
+
+
+def test_one_pass_over_the_windows_gives_what_each_figure_gives_alone() -> None:
+    image, truth = pair(9)
+    mask = torch.zeros(40, 33)
+    mask[7:31, 5:27] = 1
+    ignored = torch.zeros(40, 33, dtype=torch.bool)
+    ignored[20:24, 10:12] = True
+    for hidden in (None, ignored):
+        figures = compare(image, truth, mask, mask, hidden)
+        assert figures["ssim"] == pytest.approx(ssim(image, truth, ignored=hidden), abs=1e-12)
+        assert figures["ssim_box"] == pytest.approx(ssim_box(image, truth, mask, ignored=hidden), abs=1e-12)
+        assert figures["ssim_range_2"] == pytest.approx(ssim(image, truth, 2.0, hidden), abs=1e-12)
 
 
 def test_ssim_of_flat_images_equals_scikit_image() -> None:
