@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from twofold.errors import TwofoldError
@@ -148,6 +149,31 @@ def test_empty_or_broken_surface_is_one_clear_sentence() -> None:
         chamfer_cm(vertices, faces, vertices, faces[:0])
     with pytest.raises(TwofoldError, match=r"first .* not finite"):
         chamfer_cm(vertices * math.nan, faces, vertices, faces)
+
+
+def test_figures_are_those_of_trimeshs_search() -> None:
+    ours, theirs = sphere(0.3, 14), sphere(0.25, 11)
+    figures = compare_surfaces(*ours, *theirs, samples=300)
+    distances, cosines = [], []
+    for source, target in ((ours, theirs), (theirs, ours)):
+        points, normals = sample_surface(*source, 300, torch.Generator().manual_seed(0))
+        mesh = trimesh.Trimesh(target[0].double().numpy(), target[1].numpy(), process=False)
+        _, away, nearest = trimesh.proximity.closest_point_naive(mesh, points.double().numpy())
+        distances.append(100 * away)
+        cosines.append(abs((mesh.face_normals[nearest] * normals.numpy()).sum(1)).mean())
+    assert figures["accuracy_cm"] == pytest.approx(distances[0].mean(), rel=1e-4)
+    assert figures["chamfer_cm"] == pytest.approx((distances[0].mean() + distances[1].mean()) / 2, rel=1e-4)
+    squares = ((distances[0] ** 2).mean() + (distances[1] ** 2).mean()) / 2
+    assert figures["chamfer_l2_cm2"] == pytest.approx(squares, rel=1e-4)
+    assert figures["normal_consistency"] == pytest.approx(sum(cosines) / 2, abs=1e-3)
+
+
+def test_units_are_one_figure_in_other_words() -> None:
+    figures = compare_surfaces(*sphere(0.31, 20), *sphere(0.30, 20), samples=200)
+    assert figures["chamfer_l2_m2"] == pytest.approx(1e-4 * figures["chamfer_l2_cm2"])
+    assert figures["chamfer_vertices_halved_cm2"] == pytest.approx(1.0, abs=1e-3)
+    # 1 cm off: 1e-4 m^2, times 100.
+    assert figures["chamfer_vertices_m2_x100"] == pytest.approx(0.01, abs=1e-5)
 
 
 def test_every_figure_has_its_protocol() -> None:
