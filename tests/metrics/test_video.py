@@ -13,7 +13,7 @@ from twofold.metrics.video import GREY, PROTOCOLS, flow_error, flow_length, fram
 
 
 def waves(right: float = 0.0, down: float = 0.0, height: int = 40, width: int = 44) -> Tensor:
-    """A smooth picture, moved by so many pixels."""
+    """A smooth image, moved by so many pixels."""
     y, x = torch.meshgrid(torch.arange(height) - down, torch.arange(width) - right, indexing="ij")
     parts = [(x / 4).sin() + (y / 5).cos(), (x / 6 + y / 7).sin(), (x / 5 - y / 4).cos()]
     return 0.5 + 0.2 * torch.stack(parts, -1)
@@ -23,8 +23,8 @@ def literal_flow(first: Tensor, second: Tensor, alpha: float, iterations: int) -
     """As printed in the paper of 1981, pixel by pixel; indices beyond the edge stay on it."""
     height, width = first.shape[:2]
     grey = []
-    for picture in (first, second):
-        stored = (picture.clamp(0, 1) * 255).round().tolist()
+    for image in (first, second):
+        stored = (image.clamp(0, 1) * 255).round().tolist()
         grey.append([[sum(w * c for w, c in zip(GREY, p, strict=True)) for p in row] for row in stored])
 
     def e(i: int, j: int, k: int) -> float:
@@ -59,7 +59,7 @@ def test_flow_is_the_loop_over_pixels() -> None:
 
 
 @pytest.mark.parametrize(("right", "down"), [(0.5, 0.0), (0.0, -0.6), (0.7, 0.4)])
-def test_flow_of_a_moved_picture_is_its_motion(right: float, down: float) -> None:
+def test_flow_of_a_moved_image_is_its_motion(right: float, down: float) -> None:
     flow = horn_schunck(waves(), waves(right, down), alpha=5.0, iterations=400)[8:-8, 8:-8]
     assert flow[..., 0].mean().item() == pytest.approx(right, abs=0.06)
     assert flow[..., 1].mean().item() == pytest.approx(down, abs=0.06)

@@ -27,7 +27,7 @@ PROTOCOLS = {
     "flow_length_px": f"mean length of the flow between successive rendered images of one camera; {_SETTINGS}",
     "flow_length_truth_px": "the same of the true images",
     "flow_error_px": "mean length of the difference between the flow of the rendered images and that of the true ones, "
-    "whole picture",
+    "whole image",
     "flow_error_mask_px": "the same over the pixels where the subject is in either of the two true images",
 }
 """What each number of `frame_consistency` is, in one line."""
@@ -36,7 +36,7 @@ PROTOCOLS = {
 def horn_schunck(
     first: Float[Tensor, "h w 3"], second: Float[Tensor, "h w 3"], alpha: float = ALPHA, iterations: int = ITERATIONS
 ) -> Float[Tensor, "h w 2"]:
-    r"""Optical flow from the first picture to the second, in pixels along columns and rows.
+    r"""Optical flow from the first image to the second, in pixels along columns and rows.
 
     Minimises $\sum (E_x u + E_y v + E_t)^2 + \alpha^2 (|\nabla u|^2 + |\nabla v|^2)$ by
 
@@ -44,7 +44,7 @@ def horn_schunck(
     v \leftarrow \bar v - E_y \frac{E_x \bar u + E_y \bar v + E_t}{\alpha^2 + E_x^2 + E_y^2}$$
 
     The derivatives are means of four differences in cubes of 2 x 2 x 2 grey values; the means of $u$ and $v$ weigh the
-    four neighbours by 1/6 and the diagonal ones by 1/12. Pictures and flow go on as they end beyond the edge.
+    four neighbours by 1/6 and the diagonal ones by 1/12. Images and flow go on as they end beyond the edge.
 
     Args:
         first: colours 0..1, stored as 8 bit before their grey is taken.
