@@ -12,11 +12,13 @@ from twofold.body.skeleton import canonical_pose, pose_body, shape_body, skin
 from twofold.deform.skinning import (
     inverse_skinning,
     invert_affine,
+    map_to_canonical,
     neighbour_weights,
     smooth_neighbour_weights,
     to_canonical,
     to_posed,
     vertex_transforms,
+    with_pose_gradient,
 )
 from twofold.geometry.rotations import axis_angle_to_matrix
 
@@ -191,3 +193,35 @@ def test_points_beside_each_other_are_carried_alike_by_smooth_shares(seed):
         steps[k, weigh] = (home[1:] - home[:-1]).norm(dim=-1).max()
     torn = min(steps[1, neighbour_weights], steps[6, neighbour_weights])
     assert steps[6, smooth_neighbour_weights] < 0.2 * torn
+
+
+@pytest.mark.parametrize("k", [1, 6])
+def test_mapping_once_has_the_values_and_the_pose_gradient_of_mapping_again(k):
+    """Samples are mapped without gradients to choose among them; those that are kept get their gradient afterwards."""
+    generator = torch.Generator().manual_seed(k)
+    vertices, samples = 9, 40
+    forward = torch.eye(3, 4, dtype=torch.float64) + 0.2 * torch.randn(
+        vertices, 3, 4, generator=generator, dtype=torch.float64
+    )
+    nearest = torch.randint(vertices, (samples, k), generator=generator)
+    weights = torch.rand(samples, k, generator=generator, dtype=torch.float64)
+    weights = weights / weights.sum(1, keepdim=True)
+    x = torch.randn(samples, 3, generator=generator, dtype=torch.float64)
+    by_x = torch.randn(samples, 3, generator=generator, dtype=torch.float64)
+    by_turn = torch.randn(samples, 3, 3, generator=generator, dtype=torch.float64)
+    again, once = forward.clone().requires_grad_(), forward.clone().requires_grad_()
+    expected = to_canonical(x, nearest, weights, again)
+    with torch.no_grad():
+        x_canonical, inverse = map_to_canonical(x, nearest, weights, once)
+    kept = torch.arange(0, samples, 3)
+    found = with_pose_gradient(x_canonical[kept], inverse[kept], nearest[kept], weights[kept], once)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other[kept])
+    ((expected[0] * by_x)[kept].sum() + (expected[1] * by_turn)[kept].sum()).backward()
+    ((found[0] * by_x[kept]).sum() + (found[1] * by_turn[kept]).sum()).backward()
+    torch.testing.assert_close(once.grad, again.grad)
+    assert once.grad is not None
+    assert once.grad.abs().max() > 0.1
+    with torch.no_grad():
+        plain = with_pose_gradient(x_canonical, inverse, nearest, weights, once)
+    assert not plain[0].requires_grad
