@@ -115,6 +115,7 @@ def quick() -> Recipe:
             losses=LossConfig(
                 eikonal=0.05,
                 mask=0.3,
+                base_mask=0.3,
                 mask_form="mean",
                 s3im=0.0,
                 lpips=0.0,
