@@ -36,9 +36,11 @@ class PixelConfig:
     def __post_init__(self) -> None:
         """Refuses choices with which no image gives pixels, or more than any machine takes."""
         require_within(
-            self, rays=(1, 1_000_000), subject_share=(0, 1), surroundings=(0, 10_000), patches=(0, 1000),
+            self, rays=(0, 1_000_000), subject_share=(0, 1), surroundings=(0, 10_000), patches=(0, 1000),
             patch_size=(1, 1024), patch_on_subject=(0, 1),
         )  # fmt: skip
+        if self.rays == 0 and self.patches == 0:
+            raise ValueError("rays=0 and patches=0 leave no pixels; set one of them")
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,8 @@ def shrunk(recipe: Recipe) -> Recipe:
         return shrunk_boxed(recipe)
     if isinstance(method, Vid2AvatarConfig):
         return shrunk_vid2avatar(recipe, method)
+    if hasattr(method, "skeletal"):
+        return shrunk_skeletal(recipe)
     assert isinstance(method.field, FactorizedFieldConfig)
     # In float32, so that tolerances hold whatever the hardware is good at; `field` tests the other types.
     field = replace(method.field, width=72, high_sdf_depth=4, high_color_depth=2, hidden_dtype="float32")
@@ -63,6 +65,15 @@ def shrunk_vid2avatar(recipe: Recipe, method: Vid2AvatarConfig) -> Recipe:
         prefit=PrefitConfig(steps=5, points=32, pool=64),
     )
     pixels = replace(recipe.training.pixels, rays=64)
+    return replace(recipe, method=method, training=replace(recipe.training, pixels=pixels))
+
+
+def shrunk_skeletal(recipe: Recipe) -> Recipe:
+    """HumanNeRF and MonoHuman with a small weight volume and few samples."""
+    changed = {"samples": 32, "volume_channels": (16, 16, 16, 8), "volume_code": 8, "hidden_dtype": "float32"}
+    changed |= {"volume_every": min(recipe.method.skeletal.volume_every, 2), "guard_frames": 2, "guard_size": 16}
+    method = replace(recipe.method, skeletal=replace(recipe.method.skeletal, **changed))
+    pixels = replace(recipe.training.pixels, rays=min(recipe.training.pixels.rays, 64), patches=1, patch_size=16)
     return replace(recipe, method=method, training=replace(recipe.training, pixels=pixels))
 
 

@@ -7,6 +7,7 @@ moved forward with the weights at that one place (MonoHuman).
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -35,7 +36,10 @@ MIN_WEIGHT = 1e-4
 """Smallest sum of weights that the blended point is divided by."""
 LEAKY_SLOPE = 0.2
 LEAKY_GAIN = math.sqrt(2 / (1 + LEAKY_SLOPE**2))
-_CHANNELS = (1024, 512, 512, 256, 256, 25)
+CHANNELS = (1024, 512, 512, 256, 256)
+"""Of the network that makes the weight volume, from one position to half the volume's size."""
+CODE = 256
+"""Numbers of its learned input."""
 
 
 @dataclass(frozen=True)
@@ -123,13 +127,19 @@ class WeightVolume(nn.Module):
 
     log_prior: Tensor
 
-    def __init__(self, prior: Float[Tensor, "25 32 32 32"], generator: torch.Generator | None = None) -> None:
-        """The volume over `prior` (`bone_prior`)."""
+    def __init__(
+        self,
+        prior: Float[Tensor, "25 z y x"],
+        generator: torch.Generator | None = None,
+        channels: Sequence[int] = CHANNELS,
+        code: int = CODE,
+    ) -> None:
+        """The volume over `prior` (`bone_prior`), which has 2^n vertices along each axis for n channels."""
         super().__init__()
-        self.code = nn.Parameter(torch.randn(256, generator=generator))
-        bound = xavier_bound(256, _CHANNELS[0], LEAKY_GAIN)
-        self.first = dense_layer(256, _CHANNELS[0], bound, generator)
-        pairs = list(itertools.pairwise(_CHANNELS))
+        self.code = nn.Parameter(torch.randn(code, generator=generator))
+        bound = xavier_bound(code, channels[0], LEAKY_GAIN)
+        self.first = dense_layer(code, channels[0], bound, generator)
+        pairs = list(itertools.pairwise([*channels, len(prior)]))
         gains = [LEAKY_GAIN] * (len(pairs) - 1) + [1.0]
         self.upsampling = nn.ModuleList(
             [
@@ -137,13 +147,14 @@ class WeightVolume(nn.Module):
                 for index, (pair, gain) in enumerate(zip(pairs, gains, strict=True))
             ]
         )
-        self.register_buffer("log_prior", prior.log())
+        # Not stored: it follows from the skeleton, and far from a bone it is minus infinity.
+        self.register_buffer("log_prior", prior.log(), persistent=False)
 
-    def forward(self) -> Float[Tensor, "25 32 32 32"]:
+    def forward(self) -> Float[Tensor, "25 z y x"]:
         """Blend weights of the 24 bones and the background; they sum to one everywhere."""
         return (self.logits() + self.log_prior).softmax(0)
 
-    def logits(self) -> Float[Tensor, "25 32 32 32"]:
+    def logits(self) -> Float[Tensor, "25 z y x"]:
         """What the network adds to the logarithm of the prior."""
         h = F.leaky_relu(self.first(self.code), LEAKY_SLOPE)[None, None, None]
         for index, layer in enumerate(self.upsampling):
