@@ -25,6 +25,15 @@ def test_cameras_see_the_side_that_faces_them() -> None:
     assert (two[np.abs(vertices[:, 2]) > 0.1] == 0.5).all()
 
 
+def test_back_of_a_thin_sheet_is_not_seen() -> None:
+    sheet = trimesh.creation.box([0.4, 0.4, 0.004]).subdivide().subdivide()
+    vertices, faces = np.asarray(sheet.vertices, np.float32), np.asarray(sheet.faces, np.int64)
+    seen = observed_share(faces, [(camera([0.0, 0.0, 2.0]), vertices)])
+    within = np.abs(vertices[:, :2]).max(1) < 0.19
+    assert (seen[within & (vertices[:, 2] > 0)] == 1).all()
+    assert (seen[within & (vertices[:, 2] < 0)] == 0).all()
+
+
 def test_what_stands_behind_something_is_not_seen() -> None:
     front, back = trimesh.creation.icosphere(2, 0.3), trimesh.creation.icosphere(2, 0.1)
     back.apply_translation([0, 0, -0.6])
