@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapes import edge_uses, is_closed, soup, sphere, volume
 
+from twofold.geometry import surfaces
 from twofold.geometry.surfaces import (
     closest_on_triangles,
     face_areas,
@@ -77,15 +78,19 @@ def test_closest_point_on_a_triangle_that_is_only_a_line():
     assert closest_on_triangles(torch.tensor([1.5, 1, 0]), a, b, c).tolist() == [1.5, 0, 0]
 
 
+@pytest.mark.parametrize("by_centers", [False, True])
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 100_000))
-def test_distance_to_a_mesh_is_the_least_over_all_triangles(seed):
+def test_distance_to_a_mesh_is_the_least_over_all_triangles(by_centers, seed):
     vertices, faces = soup(seed, 60)
     vertices = vertices * 0.2
     # One triangle far larger than the others: its centre says little about where it is.
     vertices[:3] *= 40
     points = torch.randn(25, 3, generator=torch.Generator().manual_seed(seed + 1))
-    distance, triangle, nearest = point_to_mesh(points, vertices, faces)
+    if by_centers:  # the way on a GPU
+        distance, triangle, nearest = surfaces._point_to_mesh_by_centers(points, vertices[faces])
+    else:
+        distance, triangle, nearest = point_to_mesh(points, vertices, faces)
     a, b, c = vertices[faces].unbind(1)
     all_feet = closest_on_triangles(
         points[:, None].expand(25, 60, 3), a.expand(25, 60, 3), b.expand(25, 60, 3), c.expand(25, 60, 3)
