@@ -126,8 +126,8 @@ def evaluate(
     Args:
         avatar: to evaluate.
         capture: with ground truth.
-        max_images: at most so many images a split, evenly spread; None for all.
-        max_meshes: at most so many meshes.
+        max_images: at most this many images a split, evenly spread; None for all.
+        max_meshes: at most this many meshes.
 
     Returns:
         what `twofold evaluate` writes to metrics.json.

@@ -63,13 +63,13 @@ def measure_split(
     avatar: Avatar, capture: Capture, split: str, most: int | None = None, refined: bool = False,
     watch: Callable[[Frame, Picture], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
-    """Means of all image figures over a split's frames.
+    """Means of all image metrics over a split's frames.
 
     Args:
         avatar: to measure.
         capture: with the true images.
         split: "train", "novel_view" or "novel_pose".
-        most: at most so many frames, evenly spread; None for all.
+        most: at most this many frames, evenly spread; None for all.
         refined: apply what training learned about the poses (`pose_at`).
         watch: called with every frame and its rendering.
     """
@@ -115,7 +115,7 @@ def measure_geometry(
     avatar: Avatar, capture: Capture, most: int | None = None, voxel: float = 0.008,
     watch: Callable[[], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
-    """Means of the surface figures over the frames whose true mesh is known; empty where none is."""
+    """Means of the surface metrics over the frames whose true mesh is known; empty where none is."""
     rows = []
     for time, frame in _with_mesh(capture, most).items():
         posed = avatar.pose(frame.pose, frame.translation, None)
@@ -142,7 +142,7 @@ def measure_refinement(
     """How far training moved the poses, and the same avatar in the poses before and after, in at most `most` images.
 
     Held-out frames are of the split "novel_pose"; without a training frame near them their poses stay as they are.
-    `trained` are the training images' figures in the poses after, where the caller has them already.
+    `trained` are the training images' metrics in the poses after, where the caller has them already.
     """
     found: dict[str, object] = dict(avatar.pose_corrections())
     told = {"shape": "length of the change of the coefficients"}
@@ -152,10 +152,10 @@ def measure_refinement(
     for split, called, known in (("train", "train", trained), ("novel_pose", "held_out", None)):
         for when in poses:
             after = when == "after"
-            figures = known if known and after else measure_split(avatar, capture, split, most, after, watch)
-            for figure in ("psnr_box", "silhouette_iou") if figures else ():
-                found[f"{called}_{figure}_{when}"] = figures[figure]
-                told[f"{called}_{figure}_{when}"] = f"up to {most} images of the split {split} in {poses[when]}"
+            metrics = known if known and after else measure_split(avatar, capture, split, most, after, watch)
+            for metric in ("psnr_box", "silhouette_iou") if metrics else ():
+                found[f"{called}_{metric}_{when}"] = metrics[metric]
+                told[f"{called}_{metric}_{when}"] = f"up to {most} images of the split {split} in {poses[when]}"
     return found | {"protocol": told}
 
 
@@ -169,8 +169,8 @@ def evaluate(
         avatar: to measure.
         capture: with ground truth.
         folder: the run.
-        most: at most so many images a split; None for all.
-        meshes: at most so many ground-truth meshes.
+        most: at most this many images a split; None for all.
+        meshes: at most this many ground-truth meshes.
         show: progress, with the part that is done and what is being measured.
         extra: further sections for the file.
 
@@ -191,8 +191,8 @@ def measure(
     Args:
         avatar: to measure.
         capture: with ground truth.
-        most: at most so many images a split; None for all.
-        meshes: at most so many ground-truth meshes.
+        most: at most this many images a split; None for all.
+        meshes: at most this many ground-truth meshes.
         show: progress, with the part that is done and what is being measured.
 
     Raises:
@@ -231,7 +231,7 @@ def measure(
 
 
 def with_protocols(metrics: dict[str, object]) -> dict[str, object]:
-    """The figures for a table: each number of a section beside its protocol, general remarks as a line of their own."""
+    """The metrics for a table: each number of a section beside its protocol, general remarks as a line of their own."""
     out: dict[str, object] = {}
     for section, values in metrics.items():
         if not isinstance(values, dict):

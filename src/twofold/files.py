@@ -101,7 +101,7 @@ def new_folder(path: Path | str, replace: bool = False) -> Generator[Path, None,
 
     Args:
         path: must not exist or be an empty folder, unless `replace`.
-        replace: an existing folder gives way, but only once the new one is complete.
+        replace: an existing folder is overwritten, but only once the new one is complete.
 
     Raises:
         TwofoldError: something is there already; or see `plain_errors`.
@@ -283,7 +283,7 @@ def _make_parents(path: Path) -> list[Path]:
 
 def _put_in_place(temporary: Path, target: Path) -> None:
     if not target.exists() or (os.name != "nt" and not any(target.iterdir())):
-        os.replace(temporary, target)  # fails where somebody fills an empty folder at this moment
+        os.replace(temporary, target)  # fails where somebody fills an empty folder meanwhile
         return
     old = target.with_name(f"{target.name}.replaced-{secrets.token_hex(4)}")
     os.replace(target, old)

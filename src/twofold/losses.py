@@ -29,7 +29,7 @@ CONSISTENT_LIKELIHOOD, CONSISTENT_DISTANCE = 0.3, 0.05
 MAX_POINT_OFFSET = 0.04
 """Offsets up to this length cost nothing in `point_offsets`, metres."""
 MOST_STEPS = 10**12
-"""No training takes so many; a step of it means never."""
+"""More than any training takes; a step of it means never."""
 
 
 @dataclass(frozen=True)
@@ -349,10 +349,10 @@ def background(
     return ((1 - opacity.detach())[:, None] * (predicted - truth).square()).mean()
 
 
-def _mean_over(values: Tensor, shares: Tensor) -> Tensor:
+def _mean_over(values: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean, zero where nothing has weight."""
-    whole = shares.sum()
-    return (values * shares).sum() / torch.where(whole > 0, whole, torch.ones_like(whole))
+    whole = weights.sum()
+    return (values * weights).sum() / torch.where(whole > 0, whole, torch.ones_like(whole))
 
 
 def _windowed_ssim(first: Tensor, second: Tensor, center: float) -> Tensor:

@@ -17,7 +17,7 @@ def toes_of(body, motion):
 
 
 def slide_of_standing_feet(source, moved, body, motion):
-    """How far a foot strays at most, while the source's stands (moves less than 5 cm a second), metres."""
+    """How far a foot moves at most, while the source's stands (moves less than 5 cm a second), metres."""
     theirs, ours = toes_of(source, moved), toes_of(body, motion)
     speeds = torch.gradient(theirs, dim=0)[0].norm(dim=-1) * moved.fps
     worst = 0.0

@@ -1,4 +1,4 @@
-"""The way from a body's own rest pose to the T-pose, on a made-up body and on real fits."""
+"""The way from a body's own rest pose to the T-pose, on a synthetic body and on real fits."""
 
 import os
 from pathlib import Path

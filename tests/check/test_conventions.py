@@ -81,8 +81,8 @@ SPOILT = {
     "camera centre": center_column,
     "world turned over": turned_world(FLIP),
     "y up": turned_world(Z_UP),
-    "sides exchanged": lambda p: {"pose": mirrored_pose(p.pose)},
-    "sides exchanged in order": raw_exchange,
+    "left/right swap": lambda p: {"pose": mirrored_pose(p.pose)},
+    "left/right order swapped": raw_exchange,
     "turned round": lambda p: {"pose": turned_round(p.pose)},
     "translation of the pelvis": lambda p: {"translation": p.translation + p.shaped.joints[0]},
     "turning about the origin": lambda p: {

@@ -96,7 +96,7 @@ def test_each_fact_has_its_finding(good, topic):
     finding = found(change(good), topic)
     assert finding.level == level
     assert finding.what[-1] not in ".,; "
-    assert finding.mend.endswith(".")
+    assert finding.advice.endswith(".")
     assert judge(change(good)).level == ("usable" if level == "warning" else "good")
 
 
@@ -130,7 +130,7 @@ def test_units_are_recognised_by_the_height(good):
     ):
         finding = found(replace(good, stature=height), "scale")
         assert unit in finding.what
-        assert f"by {factor}." in finding.mend
+        assert f"by {factor}." in finding.advice
 
 
 def test_a_body_that_hardly_leaves_the_images_is_not_outside_by_nothing(good):
@@ -171,7 +171,7 @@ def test_a_convention_that_explains_it_stands_alone(good):
     assert not topics(told) & {"disagreement", "bad frames", "jumps", "distance", "sides unseen"}
     finding = found(told, "convention")
     assert "millimetres" in finding.what
-    assert finding.mend == "Divide the translations by 1000."
+    assert finding.advice == "Divide the translations by 1000."
     assert finding.where == ""
 
 

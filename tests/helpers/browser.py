@@ -44,7 +44,7 @@ def load_in_browser(file: Path, times: list[float], every: int, profile: Path) -
     Args:
         file: GLB or VRM.
         times: of its first animation, seconds.
-        every: every so many vertices are reported.
+        every: every Nth vertex is reported.
         profile: an empty folder for the browser.
     """
     require_web("|".join(BROWSERS))

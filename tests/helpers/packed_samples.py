@@ -6,7 +6,7 @@ from twofold.volume.samples import Samples
 
 
 def packed(counts, seed=0, dtype=torch.float64):
-    """Samples of len(counts) rays, so many on each, and a density for each sample."""
+    """Samples of len(counts) rays, that many on each, and a density for each sample."""
     generator = torch.Generator().manual_seed(seed)
     index = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
     total = len(index)

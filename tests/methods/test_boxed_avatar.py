@@ -174,7 +174,7 @@ def test_backgrounds_in_training_are_one_colour_a_ray(avatar):
     avatar.settings = before
 
 
-def test_losses_are_absolute_differences_of_both_pictures(avatar, posed, rays, person):
+def test_losses_are_absolute_differences_of_both_images(avatar, posed, rays, person):
     pixels = replace(CASES["pm_avatar"].training.pixels, rays=8)
     batch = PixelSource(person.train, person.body, person.betas, pixels).draw(1, torch.Generator().manual_seed(0))
     batch = batch.against(torch.rand(8, 3, generator=torch.Generator().manual_seed(1)))

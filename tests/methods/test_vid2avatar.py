@@ -32,7 +32,7 @@ def _own_cache(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def room(person, tmp_path_factory):
-    """The tiny person in front of a picture of many colours."""
+    """The tiny person in front of an image of many colours."""
     folder, random = tmp_path_factory.mktemp("room"), np.random.default_rng(0)
     frames = []
     for frame in person.train:

@@ -1,4 +1,4 @@
-"""Contact sheets hold every image unaltered in its place; made-up colours mean what they say."""
+"""Contact sheets hold every image unaltered in its place; colours of maps mean what they say."""
 
 import numpy as np
 import pytest

@@ -33,7 +33,7 @@ def dense(person, tmp_path_factory):
 
 @pytest.fixture
 def looking(dense, person, monkeypatch):
-    """Renders with a table of some spacing, and counts the samples that the distance network is asked about."""
+    """Renders with a table of some spacing, and counts the samples for which the distance network is queried."""
     monkeypatch.setattr(shell_sampler, "_GRID_PAYS", 10)
     asked = []
     sdf = dense.field.sdf

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from twofold.geometry.cameras import project
-from twofold.studio.scene import DISTANCE, HEIGHT, ring, room, spoil_mask
+from twofold.studio.scene import DISTANCE, HEIGHT, degrade_mask, ring, room
 
 
 @pytest.fixture(scope="module")
@@ -55,12 +55,12 @@ def disc(size=96, radius=30):
 
 def test_a_mask_without_noise_is_left_alone():
     mask = disc()
-    assert spoil_mask(mask, np.zeros((0, 2), np.float32), 0.0, np.random.default_rng(0)) is mask
+    assert degrade_mask(mask, np.zeros((0, 2), np.float32), 0.0, np.random.default_rng(0)) is mask
 
 
 def test_spoiling_is_ragged_at_the_edge_and_sound_inside():
     mask = disc()
-    spoiled = spoil_mask(mask, np.zeros((0, 2), np.float32), 0.5, np.random.default_rng(1))
+    spoiled = degrade_mask(mask, np.zeros((0, 2), np.float32), 0.5, np.random.default_rng(1))
     row, column = np.mgrid[:96, :96]
     r = np.hypot(row - 48, column - 48)
     assert (spoiled != mask)[np.abs(r - 30) < 3].any()
@@ -70,7 +70,7 @@ def test_spoiling_is_ragged_at_the_edge_and_sound_inside():
 
 def test_at_times_a_hand_is_missing():
     hand = np.array([[48.0, 48.0]], np.float32)
-    missing = [spoil_mask(disc(), hand, 1.0, np.random.default_rng(seed))[48, 48] == 0 for seed in range(60)]
+    missing = [degrade_mask(disc(), hand, 1.0, np.random.default_rng(seed))[48, 48] == 0 for seed in range(60)]
     assert 5 < sum(missing) < 30
 
 
@@ -78,7 +78,7 @@ def overlap(strength, size=96, radius=30):
     """Mean intersection over union of a disc and the same spoiled."""
     mask, values = disc(size, radius), []
     for seed in range(12):
-        spoiled = spoil_mask(mask, np.zeros((0, 2), np.float32), strength, np.random.default_rng(seed))
+        spoiled = degrade_mask(mask, np.zeros((0, 2), np.float32), strength, np.random.default_rng(seed))
         a, b = mask > 0, spoiled > 0
         values.append((a & b).sum() / (a | b).sum())
     return np.mean(values)

@@ -131,7 +131,7 @@ def reached(folder: Path) -> int:
 
 
 def kills(count: int, person: Capture, tmp_path: Path) -> list[int]:
-    """Kills a training so many times, then lets it finish; the step of its checkpoint after each kill.
+    """Kills a training that many times, then lets it finish; the step of its checkpoint after each kill.
 
     Each time it may do up to nine steps, and then so much of the next ones as fits into a random part of 0.3 seconds.
     """

@@ -163,7 +163,7 @@ def test_single_pixels_come_from_the_box_around_the_subject_and_from_around_the_
     box = torch.zeros_like(reachable)
     low, high = inside.amin(0), inside.amax(0) + 1
     box[low[0] : high[0], low[1] : high[1]] = True
-    assert torch.equal(seen[0], box & reachable), "so many draws leave none out"
+    assert torch.equal(seen[0], box & reachable), "this many draws leave none out"
     assert not (seen[1] & ~reachable).any()
     assert (seen[1] & reachable).sum() > 0.5 * reachable.sum()
 

@@ -70,7 +70,7 @@ def kept_contacts(
         joints: of the target's T-pose, metres.
         sole: height of the target's soles in the T-pose, metres.
         toes: paths of the source's foot fronts (left, right), scaled to the target's size, y up, metres.
-        still: metres that a resting foot of the source may stray, or be above the floor, without being followed, where
+        still: metres that a resting foot of the source may move, or be above the floor, without being followed, where
             its path is not known better than that.
     """
     rests = resting(toes, motion.fps)
@@ -108,9 +108,9 @@ def _corrections(
     for first, end in _runs(rests):
         path = wanted[first:end].numpy()
         middle = path.mean(0)
-        stray = path - middle
-        far = np.linalg.norm(stray, axis=1, keepdims=True)
-        known[first:end] -= stray * np.minimum(1, still / np.maximum(far, 1e-12))
+        off = path - middle
+        far = np.linalg.norm(off, axis=1, keepdims=True)
+        known[first:end] -= off * np.minimum(1, still / np.maximum(far, 1e-12))
         if abs(middle[1] - rise) < still:
             known[first:end, 1] += rise - middle[1]
         known[first:end, [0, 2]] -= known[first:end, [0, 2]].mean(0)

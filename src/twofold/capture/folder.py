@@ -110,7 +110,7 @@ class CaptureWriter:
 
     Args:
         folder: where to; missing folders above are made.
-        overwrite: a capture that stands there gives way (nothing else does).
+        overwrite: a capture that stands there is overwritten (nothing else is).
 
     Raises:
         TwofoldError: on entry where the folder is taken or cannot be made, later where the disk refuses.
@@ -233,7 +233,7 @@ class CaptureWriter:
         self._finished = True
 
     def _may_replace(self) -> bool:
-        """Whether an existing folder may give way: only a capture with nothing of the user's own in it."""
+        """Whether an existing folder may be overwritten: only a capture with nothing of the user's own in it."""
         with plain_errors(self._folder):
             found = {path.name for path in self._folder.iterdir()} if self._folder.is_dir() else set[str]()
         if not found:

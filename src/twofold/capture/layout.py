@@ -1,6 +1,6 @@
 """The layout of a capture folder, and its small files read with every fault noted.
 
-What can be read is returned beside one sentence for each fault, so that a user can mend all of them in one go.
+What can be read is returned beside one sentence for each fault, so that a user can fix all of them at once.
 """
 
 import os

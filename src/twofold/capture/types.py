@@ -99,7 +99,7 @@ class Capture:
 
 
 def spread(items: Sequence[Item], most: int | None = None) -> list[Item]:
-    """At most so many items, evenly spread, the first and the last among them; None for all.
+    """At most this many items, evenly spread, the first and the last among them; None for all.
 
     >>> spread("abcdefg", 3)
     ['a', 'd', 'g']

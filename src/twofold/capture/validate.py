@@ -220,11 +220,11 @@ def _mask_fault(folder: Path, size: tuple[int, int], item: tuple[Path, ShownJoin
         return damaged
     where = path.relative_to(folder).as_posix()
     if mask.max() == 0:
-        return f"{where} is all black, so nobody is there; mend it or take this time out of the splits."
+        return f"{where} is all black, so nobody is there; fix it or take this time out of the splits."
     if mask.max() < _PERSON:
         return f"{where} reaches only {mask.max()}; the person should be 255."
     if mask.min() >= _PERSON:
-        return f"{where} is all white, as if the person filled the image; mend it or take this time out of the splits."
+        return f"{where} is all white, as if the person filled the image; fix it or take this time out of the splits."
     columns, rows = np.flatnonzero((mask >= _PERSON).any(0)), np.flatnonzero((mask >= _PERSON).any(1))
     if joints is not None and len(joints.inside) and mask.shape == size:
         low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]])

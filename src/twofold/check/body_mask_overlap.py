@@ -16,7 +16,7 @@ LARGER, SMALLER = 1.2, 0.92
 OFF = 0.05
 """Masks off the body's middle by more than this, in body heights, everywhere alike: a hand's breadth."""
 MOST_NAMED = 4
-"""So many exchanged images are named one by one."""
+"""At most this many exchanged images are named one by one."""
 
 
 def agreement(facts: Facts) -> Iterator[Finding]:
@@ -66,13 +66,13 @@ def _convention(doubt: Doubt, facts: Facts) -> Iterator[Finding]:
     if not found.conventions:
         return
     wrong = " and ".join(c.wrong for c in found.conventions)
-    mend = "; then ".join(c.mend for c in found.conventions)
+    advice = "; then ".join(c.advice for c in found.conventions)
     certain = found.given < POOR or any(c.family == "pose" for c in found.conventions)
     yield Finding(
         graded(certain),
         "convention",
         f"It looks as if {wrong}: with that undone, silhouettes agree by {found.iou:.2f} instead of {found.given:.2f}",
-        f"{mend[0].upper()}{mend[1:]}.",
+        f"{advice[0].upper()}{advice[1:]}.",
         "" if len(doubt.cameras) == len(facts.cameras) else f"camera {', '.join(doubt.cameras)}",
     )
 
@@ -82,7 +82,7 @@ def _disagreement(iou: float, where: str) -> Finding:
         "fault",
         "disagreement",
         f"Body and masks do not agree (mean IoU {iou:.2f}), and no usual convention of axes, sides, units or "
-        "intrinsics would mend it",
+        "intrinsics would fix it",
         "Look at the overlays below: fit the poses again, or see whether images, masks and poses belong together.",
         where,
     )
@@ -146,7 +146,7 @@ def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
             graded(len(turned) > MOST_BAD * len(frames)),
             "facing",
             f"In {counted(len(turned), 'image')} the body fits better facing the other way",
-            "Turn these roots by half about the body's axis and exchange left and right, or leave them out: check "
+            "Rotate these roots by 180 degrees about the body's axis and swap left and right, or leave them out: check "
             "--write-splits.",
             places(turned),
             tuple((f.camera, f.time) for f in turned),
@@ -161,7 +161,7 @@ def _faces(facts: Facts) -> Iterator[Finding]:
             "faces",
             f"A face looks at the camera in {len(facts.faces)} of {len(facts.backs)} images where the body shows its "
             "back",
-            "Turn these roots by half about the body's axis and exchange left and right limbs.",
+            "Rotate these roots by 180 degrees about the body's axis and exchange left and right limbs.",
             places_of(facts.faces),
         )
 

@@ -49,14 +49,14 @@ class Convention:
     Attributes:
         name: short, for `check.json`.
         wrong: what is the matter, where bodies fit with it.
-        mend: what to do then.
+        advice: what to do then.
         family: guesses of different families may be combined.
         change: what it makes of a frame.
     """
 
     name: str
     wrong: str
-    mend: str
+    advice: str
     family: str
     change: Callable[[Placed], Placed]
 
@@ -195,7 +195,7 @@ CONVENTIONS: tuple[Convention, ...] = (
     ),
     Convention(
         "world turned over", "the body's world has y and z the other way round than the cameras' (y down, z away)",
-        "turn root rotations and translations by half about x, or the cameras", "world",
+        "rotate roots and translations by 180 degrees about x, or the cameras", "world",
         _world((1, 0, 0), (0, -1, 0), (0, 0, -1)),
     ),
     Convention(
@@ -209,22 +209,22 @@ CONVENTIONS: tuple[Convention, ...] = (
         _world((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     ),
     Convention(
-        "facing away", "the body's world is turned by half about y against the cameras'",
-        "turn root rotations and translations by half about y, or the cameras", "world",
+        "facing away", "the body's world is rotated by 180 degrees about y against the cameras'",
+        "rotate roots and translations by 180 degrees about y, or the cameras", "world",
         _world((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
     ),
     Convention(
-        "upside down", "the body's world is turned by half about z against the cameras'",
-        "turn root rotations and translations by half about z, or the cameras", "world",
+        "upside down", "the body's world is rotated by 180 degrees about z against the cameras'",
+        "rotate roots and translations by 180 degrees about z, or the cameras", "world",
         _world((-1, 0, 0), (0, -1, 0), (0, 0, 1)),
     ),
     Convention(
-        "sides exchanged", "the left and right limbs are exchanged",
+        "left/right swap", "the left and right limbs are exchanged",
         "exchange the rotations of left and right joints and negate their y and z parts", "pose",
         lambda p: p.posed(mirrored_pose(p.pose)),
     ),
     Convention(
-        "sides exchanged in order", "the left and right joints are in the wrong order",
+        "left/right order swapped", "the left and right joints are in the wrong order",
         "exchange the rotations of left and right joints", "pose", _raw_swap,
     ),
     Convention(
@@ -239,8 +239,8 @@ CONVENTIONS: tuple[Convention, ...] = (
         _mirrored_whole,
     ),
     Convention(
-        "turned round", "the body faces the other way", "turn the roots by half about the body's axis and exchange "
-        "left and right limbs", "pose", lambda p: p.posed(turned_round(p.pose)),
+        "turned round", "the body faces the other way", "rotate the roots by 180 degrees about the body's axis and "
+        "swap left and right limbs", "pose", lambda p: p.posed(turned_round(p.pose)),
     ),
     Convention(
         "world mirrored in x", "the body's world is mirrored against the cameras' (x the other way)",
@@ -260,7 +260,7 @@ CONVENTIONS: tuple[Convention, ...] = (
     ),
     Convention(
         "root in other axes", "the root rotations have y and z the other way round than the translations",
-        "turn the roots by half about x", "pose", _root(lambda m: _FLIP @ m),
+        "rotate the roots by 180 degrees about x", "pose", _root(lambda m: _FLIP @ m),
     ),
     Convention(
         "translation in other axes", "the translations have y and z the other way round than the root rotations",
@@ -306,7 +306,7 @@ CONVENTIONS: tuple[Convention, ...] = (
         "divide template, joints and the shape bases in body.npz by 100", "unit", lambda p: _shrunk(p, 1e-2),
     ),
     Convention(
-        "upside-down images", "images and masks stand on their heads", "turn them by half", "picture",
+        "upside-down images", "images and masks stand on their heads", "rotate them by 180 degrees", "picture",
         _picture(lambda h, w: ((-1, 0, w - 1), (0, -1, h - 1), (0, 0, 1))),
     ),
     Convention(

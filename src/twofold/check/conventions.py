@@ -33,9 +33,9 @@ IN_MOST = 0.75
 EXCHANGED, EXCHANGED_GAIN = 0.7, 0.15
 """An image shows another frame's pose where that fits so well, and so much better than its own."""
 MOST_PAIRS = 16
-"""So many of some seven hundred pairs are tried on all frames."""
+"""This many of some seven hundred pairs are tried on all frames."""
 MOMENTS = 5
-"""So many frames early or late are tried."""
+"""Up to this many frames early or late are tried."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What would mend a capture, as far as silhouettes can tell.
+    """What would fix a capture, as far as silhouettes can tell.
 
     Attributes:
         given: mean IoU as the capture is, drawn roughly.

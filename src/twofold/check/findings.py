@@ -20,20 +20,20 @@ class Finding:
         topic: short, the same in every version.
         what: a sentence.
         where: cameras and frames; empty for the whole capture.
-        mend: a sentence about what to do.
+        advice: a sentence about what to do.
         images: camera and time of those that `check --write-splits` leaves out because of it.
     """
 
     level: Level
     topic: str
     what: str
-    mend: str
+    advice: str
     where: str = ""
     images: tuple[tuple[str, int], ...] = ()
 
     def __str__(self) -> str:
         where = f" ({self.where})" if self.where else ""
-        return f"{self.what.rstrip('.')}{where}. {self.mend}"
+        return f"{self.what.rstrip('.')}{where}. {self.advice}"
 
 
 @dataclass(frozen=True)

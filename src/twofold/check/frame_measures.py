@@ -123,12 +123,12 @@ def surface_points(shaped: ShapedBody, count: int = POINTS) -> ShapedBody:
     golden = (torch.arange(count, dtype=torch.float64) * 0.6180339887498949) % 1
     other = (torch.arange(count, dtype=torch.float64) * 0.7548776662466927) % 1
     root = golden.sqrt()
-    shares = torch.stack([1 - root, root * (1 - other), root * other], -1).to(shaped.vertices.dtype)
+    barycentric = torch.stack([1 - root, root * (1 - other), root * other], -1).to(shaped.vertices.dtype)
     corners = shaped.faces[face]
 
     def between(values: Tensor) -> Tensor:
         flat = values.flatten(1)
-        return sum(shares[:, k, None] * flat[corners[:, k]] for k in range(3)).unflatten(1, values.shape[1:])  # type: ignore[union-attr]
+        return sum(barycentric[:, k, None] * flat[corners[:, k]] for k in range(3)).unflatten(1, values.shape[1:])  # type: ignore[union-attr]
 
     basis = between(shaped.pose_basis) if shaped.pose_basis.shape[-1] else shaped.pose_basis.new_zeros(count, 3, 0)
     return ShapedBody(between(shaped.vertices), shaped.joints, shaped.faces[:0], between(shaped.weights), basis)
@@ -147,7 +147,7 @@ def mirrored_pose(pose: Float[Tensor, "24 3"]) -> Float[Tensor, "24 3"]:
 
 
 def turned_round(pose: Float[Tensor, "24 3"]) -> Float[Tensor, "24 3"]:
-    """The mirrored pose with the root turned by half about the body's own axis.
+    """The mirrored pose with the root rotated by 180 degrees about the body's own axis.
 
     Limbs stay where they are, as seen from the front or the back, and the body faces the other way.
     """

@@ -19,7 +19,7 @@ class MaskFacts:
     Attributes:
         share: of the image that the person covers.
         softness: width of the soft edge, pixels; 0 for a mask of black and white alone.
-        roughness: how far the edge strays from a smooth one, as a share of the person's height.
+        roughness: how far the edge deviates from a smooth one, as a share of the person's height.
         grain: steps of the outline, pixels: 1 for a mask made at its own size, 8 for one enlarged eightfold.
         borders: sides of the image that the mask runs into: "left", "top", "right", "bottom".
         pieces: connected parts that matter.
@@ -50,7 +50,7 @@ def mask_facts(mask: UInt8[np.ndarray, "h w"]) -> MaskFacts:
     grey = np.count_nonzero((mask > 255 * SOFT[0]) & (mask < 255 * SOFT[1]))
     sizes = _piece_sizes(inner)
     ends = {"left": person[:, 0], "top": person[0], "right": person[:, -1], "bottom": person[-1]}
-    # A stray pixel on the border is no cropped limb.
+    # A single pixel on the border is no cropped limb.
     least = max(2, round(0.01 * tall))
     return MaskFacts(
         share=float(person.mean()),

@@ -69,7 +69,7 @@ class Doubt:
 
     Attributes:
         cameras: their names; all of a capture where all are alike.
-        diagnosis: what would mend them.
+        diagnosis: what would fix them.
     """
 
     cameras: tuple[str, ...]
@@ -128,12 +128,12 @@ def measure_capture(
 
     Args:
         folder: the capture.
-        most: so many images are looked at, spread evenly, two thirds of them training images.
-        watch: called with the share that is done.
+        most: this many images are checked, spread evenly, two thirds of them training images.
+        watch: called with the fraction that is done.
 
     Raises:
         TwofoldError: it cannot be used at all. Every fault is listed; where the body merely stands in the wrong place,
-            the convention that would mend it is named.
+            the convention that would fix it is named.
     """
     folder = Path(folder)
     contents = _usable(folder)
@@ -239,8 +239,10 @@ def _why_elsewhere(contents: Contents) -> str:
     if not found.conventions:
         return "No usual convention of axes, units or translations would bring body and masks together."
     wrong = " and ".join(c.wrong for c in found.conventions)
-    mend = "; then ".join(c.mend for c in found.conventions)
-    return f"It looks as if {wrong}. {mend[0].upper()}{mend[1:]}, and silhouettes will agree by {found.iou:.2f} (IoU)."
+    advice = "; then ".join(c.advice for c in found.conventions)
+    return (
+        f"It looks as if {wrong}. {advice[0].upper()}{advice[1:]}, and silhouettes will agree by {found.iou:.2f} (IoU)."
+    )
 
 
 def _motion(contents: Contents) -> tuple[Float[Tensor, "T 24 3"], Float[Tensor, "T 3"]]:
@@ -252,7 +254,7 @@ def _motion(contents: Contents) -> tuple[Float[Tensor, "T 24 3"], Float[Tensor, 
 def _doubts(
     looked: Sequence[FrameFacts], frames: dict[tuple[str, int], Frame], points: ShapedBody
 ) -> tuple[Doubt, ...]:
-    """A guess about all cameras together or, where none mends all, one about each that is poor."""
+    """A guess about all cameras together or, where none fixes all, one about each that is poor."""
     groups = _by_camera(f for f in looked if not inverted(f))
     poor = [(name,) for name, group in groups.items() if np.mean([f.iou for f in group]) < POOR]
     doubts: list[Doubt] = []

@@ -17,12 +17,12 @@ from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.prepare.turning import arc, camera_directions, sides_seen
 
 SLACK, ACCELERATION = 0.12, 40.0
-"""A joint may stray from the middle between its neighbours in time by an estimator's error, metres, and by what four
+"""A joint may deviate from the middle between its neighbours in time by an estimator's error, metres, and by what four
 times gravity does to it, m/s2: more than hands do in quick sports."""
 TURN_SPEED = 12.0
 """Faster the trunk turns in no ordinary motion, rad/s: two turns a second is a figure skater's spin."""
 NOVEL_BLOCK = 3
-"""So many novel poses in a row may be a motion of their own, with a cut before and after."""
+"""This many novel poses in a row may be a motion of their own, with a cut before and after."""
 NEW_POSE = math.radians(30)
 """Poses count as different where a joint is turned by so much more."""
 STILL = 15.0
@@ -41,7 +41,7 @@ class MotionFacts:
     Attributes:
         moments: that any split shows.
         jumps: frames that no person could get to from the one before and after.
-        jitter: how far joints stray from the middle between their neighbours, median, metres.
+        jitter: how far joints deviate from the middle between their neighbours, median, metres.
         ranges: for each limb of `LIMBS` how far its joint turns between any two training frames, degrees.
         poses: training frames whose poses differ from each other.
         azimuths: of the training cameras around the body, degrees; 0 in front, 90 at the person's left.
@@ -93,11 +93,11 @@ def motion_facts(
     inside = (placed - placed[:, :1]) @ rotations[:, 0]
     moving = torch.cat([placed[:, :1], inside[:, 1:]], 1)
     jumps: list[int] = []
-    strays: list[np.ndarray] = []
+    deviations: list[np.ndarray] = []
     for run in _runs(times, {frame.time for frame in splits.get("novel_pose", ())}):
-        bad, stray = _jumps(moving[run], rotations[run, 0], np.array(run) / fps)
+        bad, deviation = _jumps(moving[run], rotations[run, 0], np.array(run) / fps)
         jumps += [time for time, yes in zip(run, bad.tolist(), strict=True) if yes]
-        strays.append(stray)
+        deviations.append(deviation)
     azimuths, elevations = _directions(train, rotations[:, 0], placed[:, 0])
     novel = sorted({frame.time for frame in splits.get("novel_pose", ())})
     few = torch.tensor(spread(train_times, 150))
@@ -107,7 +107,7 @@ def motion_facts(
     return MotionFacts(
         moments=tuple(times),
         jumps=tuple(jumps),
-        jitter=float(np.median(np.concatenate(strays))) if any(map(len, strays)) else 0.0,
+        jitter=float(np.median(np.concatenate(deviations))) if any(map(len, deviations)) else 0.0,
         ranges=_ranges(rotations[few]),
         poses=_different(rotations[few]),
         azimuths=tuple(azimuths),
@@ -166,7 +166,7 @@ def _runs(times: Sequence[int], novel: Set[int]) -> list[list[int]]:
 def _jumps(
     joints: Float[Tensor, "t 24 3"], roots: Float[Tensor, "t 3 3"], seconds: Float[np.ndarray, "t"]
 ) -> tuple[Bool[np.ndarray, "t"], Float[np.ndarray, "s"]]:
-    """Which frames are out of reach of both neighbours or of the one before, and by how much joints stray (metres).
+    """Which frames are out of reach of both neighbours or of the one before, and by how much joints deviate (metres).
 
     Args:
         joints: the pelvis in the world, the others about it in the body's own axes, so that turning moves none.
@@ -181,7 +181,7 @@ def _jumps(
     weight = torch.as_tensor(after / (before + after), dtype=joints.dtype)[:, None, None]
     away = (joints[1:-1] - weight * joints[:-2] - (1 - weight) * joints[2:]).norm(dim=-1).numpy()
     excess = away.max(1) - (SLACK + 0.5 * ACCELERATION * before * after)
-    # Beside one wrong frame others stray by half as much; only the worst of a group is it.
+    # Beside one wrong frame others deviate by half as much; only the worst of a group is it.
     worst = ndimage.maximum_filter1d(excess, 3, mode="nearest") == excess
     bad[1:-1] = (excess > 0) & worst
     bad[1:] |= _angles(roots[:-1].transpose(-1, -2) @ roots[1:]).numpy() > TURN_SPEED * np.diff(seconds)

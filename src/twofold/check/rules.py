@@ -20,14 +20,14 @@ STATURES, POSSIBLE_STATURES = (1.2, 2.2), (0.5, 3.0)
 DISTANCES = (0.3, 30.0)
 """Metres; farther away no phone shows a face."""
 VIEW_ANGLES = (8.0, 110.0)
-"""Degrees: a long telephoto lens and an action camera. Beyond these, a made-up focal length (5000, say) is likelier."""
+"""Degrees: a long telephoto lens and an action camera. Beyond these, a guessed focal length (5000, say) is likelier."""
 ODD_PIXELS, OFF_CENTER = 0.05, 0.15
 """fy against fx; distance of the principal point from the image's middle, in image lengths."""
 BRIGHTER = 1.3
 """Ratio of the brightnesses of a background: a third of an aperture stop."""
 HARD, SOFT, RAGGED, GRAIN = 0.05, 0.03, 0.0015, 0.012
 """Masks: width of the soft edge in pixels below which it is hard; in body heights, the width above which it is too soft
-(5 cm), how far an outline strays from a smooth one (3 mm, good ones 1 mm), and how large its steps are (2 cm)."""
+(5 cm), how far an outline deviates from a smooth one (3 mm, good ones 1 mm), and how large its steps are (2 cm)."""
 LOOSE = 0.05
 """Share of a mask that does not hang together with the rest: a forearm."""
 CROPPED, CUT_OFF = 0.1, 0.3
@@ -65,7 +65,7 @@ def _merged(findings: list[Finding]) -> list[Finding]:
     """Findings of which those that differ in their place alone are one."""
     groups: dict[tuple[Level, str, str, str], list[Finding]] = defaultdict(list)
     for f in findings:
-        groups[f.level, f.topic, f.what, f.mend].append(f)
+        groups[f.level, f.topic, f.what, f.advice].append(f)
     return [
         Finding(*key, "; ".join(f.where for f in group if f.where), tuple(image for f in group for image in f.images))
         for key, group in groups.items()
@@ -152,7 +152,7 @@ def _masks(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "jagged masks",
-            f"Outlines are ragged: they stray {ragged:.1%} of the body height from smooth ones",
+            f"Outlines are ragged: they deviate {ragged:.1%} of the body height from smooth ones",
             "Smooth the masks, or make them with a better segmentation.",
         )
     elif grain > max(3.0, GRAIN * tall):
@@ -236,7 +236,7 @@ def _sides_and_poses(facts: Facts) -> Iterator[Finding]:
             "novel poses",
             f"No joint of a novel_pose frame is turned by more than {motion.novelty:.0f} degrees against the nearest "
             "training pose (median)",
-            "Figures will tell how well frames in between are met, not how well new poses are.",
+            "Metrics will tell how well frames in between are met, not how well new poses are.",
         )
     if motion.up < 0.5:
         yield Finding(
@@ -266,7 +266,7 @@ def _motion(facts: Facts) -> Iterator[Finding]:
             "note",
             "jumps",
             f"{counted(len(rest), 'test frame')} cannot be reached in time from the one before",
-            "Figures measured there may be too low.",
+            "Metrics measured there may be too low.",
             f"times {spans(rest)}",
         )
     if motion.jitter > JITTER:

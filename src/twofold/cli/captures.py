@@ -1,4 +1,4 @@
-"""Commands that make captures and look at them: `twofold studio`, `import`, `prepare`, `check`."""
+"""Commands that make captures and check them: `twofold studio`, `import`, `prepare`, `check`."""
 
 import sys
 from pathlib import Path
@@ -20,13 +20,13 @@ def studio(
     mask_noise: float = 0.0,
     background: Literal["black", "textured"] = "black",
 ) -> None:
-    """Makes a capture of a person who never lived, with the truth about shape and pose.
+    """Make a capture of a synthetic subject, with ground truth of shape and pose.
 
     Args:
         out: Folder to make.
-        seed: Who, wearing what, moving how.
+        seed: Seed of body, clothes and motion.
         size: Rows and columns of the images.
-        frames: Frames; the last fifth shows a motion that is not trained on.
+        frames: Number of frames; the last fifth shows a motion that is not trained on.
         cameras: In a ring around the person; the first one trains.
         pose_noise: Error of the given poses, radians (standard deviation).
         mask_noise: Faults of the masks, 0 to 1.
@@ -49,12 +49,12 @@ def import_capture(
     fps: float | None = None,
     credit: str = "",
 ) -> None:
-    """Makes a capture folder from one that was prepared elsewhere (images, masks, capture.npz).
+    """Make a capture folder from one that was prepared elsewhere (images, masks, capture.npz).
 
     Args:
         source: Folder with images/, masks/ and capture.npz.
         out: Folder to make.
-        held_out: Of so many frames one is kept for testing.
+        held_out: Every Nth frame is held out for testing.
         drop_below_iou: Leaves out frames whose fitted body covers the mask worse than this, 0 to 1.
         held_objects: Whether a ball or the like that moves apart from the body is taken out of the masks.
         fps: Frames a second; by default what capture.npz says, else 30.
@@ -91,7 +91,7 @@ def prepare(
     drop: str | None = None,
     credit: str = "",
 ) -> None:
-    """Makes a capture folder from a video of one person, or from several synchronised ones.
+    """Make a capture folder from a video of one person, or from several synchronised ones.
 
     Args:
         videos: A video file or a folder of images; several need --calibration.
@@ -105,9 +105,9 @@ def prepare(
         landmarks: Your own landmarks: a file (a folder with one file for each of several videos).
         poses: Your own poses of the body, as npz with poses, translations and betas; nothing is fitted then.
         train_camera: Which of several videos trains; by default the first.
-        held_out: Of so many frames one is kept for testing.
+        held_out: Every Nth frame is held out for testing.
         held_objects: Whether a ball or the like that moves apart from the body is taken out of the masks.
-        several_people: Whether a second person in view ends it, or whoever is found is taken.
+        several_people: What a second person in view means: refuse the video, or take whoever is found.
         person: Which of several people is meant: the largest, a number (1 is the leftmost in the first image), or the
             one in your own masks; by default the one in your own masks, landmarks or poses.
         drop: Frames to leave out of the splits, such as 3,7-9.
@@ -140,8 +140,8 @@ def check(
 
     Args:
         capture: Capture folder.
-        out: Folder for the report and its numbers; by default CAPTURE/check.
-        max_images: Images looked at, evenly spread.
+        out: Folder for the report and its metrics; by default CAPTURE/check.
+        max_images: Images to check, evenly spread.
         write_splits: Whether images that findings advise to leave out are taken out of the capture's splits.
     """
     from twofold.capture.splits import leave_out
@@ -164,7 +164,7 @@ def check(
     if write_splits and judgement.unfit:
         left = leave_out(capture, judgement.unfit)
         say(
-            f"{len(left)} of the images looked at are left out of the splits of {capture / 'capture.json'}: "
+            f"{len(left)} of the images checked are left out of the splits of {capture / 'capture.json'}: "
             f"{places_of(left)}.",
             f"twofold check {capture}",
         )

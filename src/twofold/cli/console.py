@@ -17,7 +17,7 @@ from twofold.errors import TwofoldError
 ALONE = os.environ.get("RANK", "0") == "0"
 """Of several processes that train together, the first one speaks for all."""
 LINE_EVERY = 30.0
-"""Seconds after which progress is told anew where standard error is no terminal, and at every tenth of the way."""
+"""Seconds after which progress is written again where standard error is no terminal, and at every tenth of the way."""
 
 WINDOW = 60.0
 """Seconds of the past that say how fast it goes, at least; of a long work, its later half."""
@@ -25,7 +25,7 @@ WINDOW = 60.0
 
 @final
 class TimeLeft(ProgressColumn):
-    """How long it still takes, seconds: at the speed of the near past up to this moment.
+    """How long it still takes, seconds: at the speed of the near past up to now.
 
     Since the time that has passed without any news counts as well, what stands still takes ever longer, and does not
     stay "1 second left".

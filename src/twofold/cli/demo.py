@@ -1,4 +1,4 @@
-"""`twofold demo`: film a made-up person, train, measure, show. The whole idea in three minutes on two cores."""
+"""`twofold demo`: film a synthetic subject, train, measure, show. The whole idea in three minutes on two cores."""
 
 import time
 from collections.abc import Callable
@@ -57,7 +57,7 @@ def run_demo(out: Path, seed: int, show: Callable[[float, str], None]) -> Path:
     Args:
         out: folder to make; a demo that lies there is overwritten.
         seed: who is filmed.
-        show: told the share that is done and what is being done.
+        show: called with the fraction that is done and what is being done.
 
     Returns:
         the page.
@@ -106,8 +106,8 @@ def _fill(out: Path, seed: int, config: StudioConfig, recipe: Recipe, show: Call
     def lap(name: str) -> None:
         seconds[name] = time.monotonic() - begun - sum(seconds.values())
 
-    show(0.0, "filming a made-up person")
-    make_studio(config, out / "capture", lambda done: show(0.12 * done, "filming a made-up person"), overwrite=True)
+    show(0.0, "filming a synthetic subject")
+    make_studio(config, out / "capture", lambda done: show(0.12 * done, "filming a synthetic subject"), overwrite=True)
     capture = read_capture(out / "capture")
     lap("studio")
 

@@ -43,7 +43,7 @@ def export(
         run: Run folder.
         format: One or several of glb, vrm, ply, obj, bvh.
         out: Folder for the files; by default RUN/exports.
-        faces: About so many triangles, 500 to 2,000,000.
+        faces: Number of triangles, roughly, 500 to 2,000,000.
         frame: Write the mesh as it stands in this frame of the capture, without a rig.
         motion: Animations of the character: capture, none, .bvh or .npz files, walk, turn, dance, range-of-motion.
         branch: Surface of the full field, or of the base branch.
@@ -52,7 +52,7 @@ def export(
         texture: Rows and columns of the texture, 64 to 8192.
         vertex_colors: Colours at the vertices instead of a texture.
         image: Textures inside the files: png (lossless) or jpeg (small).
-        morphs: Morph targets at most, 0 to 16.
+        morphs: Largest number of morph targets, 0 to 16.
         rig: Names of the joints.
         name: Of the person, for the files' metadata.
         author: Who made it, for the files' metadata.

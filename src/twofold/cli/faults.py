@@ -25,7 +25,7 @@ _LOWER = {
     "train": "lower --set training.pixels.rays=... first, then widen --set method.field.low_voxels=... and high_voxels",
     "render": "lower --chunk, then --size",
     "evaluate": "measure no meshes (--max-meshes 0), or close other programs",
-    "check": "look at fewer images (--max-images)",
+    "check": "check fewer images (--max-images)",
     "prepare": "make the images smaller (--max-size), or use fewer of them (--fps)",
     "studio": "lower --size or --frames",
     "demo": "close other programs",

@@ -40,14 +40,14 @@ def train(
     resume: Path | None = None,
     settings: bool = False,
 ) -> None:
-    """Trains an avatar from a capture folder.
+    """Train an avatar from a capture folder.
 
     Args:
         capture: Capture folder (`twofold prepare`, `twofold studio`, `twofold import`).
         out: Run folder to make; by default runs/NAME-RECIPE.
         recipe: quick (minutes on a CPU), fast (the released networks, sampled near the body), released, paper.
         set: Settings, such as training.steps=500; one or several, once or several times.
-        seed: Of everything random.
+        seed: Seed of all random numbers.
         device: auto, cpu, cuda or cuda:N.
         resume: Run folder of an interrupted training to continue.
         settings: Shows every setting that --set can change, as the recipe has it, and does nothing else.
@@ -141,7 +141,7 @@ def render(
     device: str = "auto",
     motion_video: Annotated[MotionView, tyro.conf.OmitArgPrefixes] = NO_MOTION,
 ) -> None:
-    """Draws an avatar: an orbit, unseen views, unseen poses, front and back; branches, normals, opacity; or a motion.
+    """Render an avatar: an orbit, unseen views, unseen poses, front and back; branches, normals, opacity; or a motion.
 
     Args:
         run: Run folder.
@@ -173,7 +173,7 @@ def render(
     read = read_capture(source)
     require_same(run, read, motion=False)
     folder = out or run / "renders"
-    with made_folder(folder), bar("Drawing") as show:
+    with made_folder(folder), bar("Rendering") as show:
         render_run(avatar, read, folder, what, size, chunk, lambda done: show(done, ""))
     measure = _with_capture(["twofold", "evaluate", str(run)], capture)
     say(f"The images are in {folder}.", after_rendering(run, source, measure, read_recipe(run).name))
@@ -186,13 +186,13 @@ def evaluate(
     max_meshes: int | Literal["all"] = 4,
     device: str = "auto",
 ) -> None:
-    """Measures an avatar against what its capture knows to be true; writes RUN/metrics.json.
+    """Measure an avatar against its capture's held-out images and ground truth; writes RUN/metrics.json.
 
     Args:
         run: Run folder.
         capture: Capture folder, if it has moved since training.
         max_images: Images measured of each split, evenly spread; all for all.
-        max_meshes: True meshes measured, evenly spread; all for all.
+        max_meshes: Ground-truth meshes measured, evenly spread; all for all.
         device: auto, cpu, cuda or cuda:N.
     """
     from twofold.capture.folder import read_capture
@@ -224,16 +224,16 @@ def evaluate(
 
 
 def _with_capture(words: list[str], capture: Path | None) -> str:
-    """A command about a run, which has to be told of a capture that has moved as the one before it was."""
+    """A command about a run, which names a capture that has moved, as the one before it did."""
     return shlex.join([*words, *(["--capture", str(capture)] if capture else [])])
 
 
 def demo(out: Path = Path("demo"), seed: int = 0) -> None:
-    """The whole idea in three minutes: films a made-up person, trains an avatar, measures it, shows it on a page.
+    """Show the whole pipeline in three minutes: film a synthetic subject, train an avatar, measure it, write a report.
 
     Args:
         out: Folder to make.
-        seed: Who is filmed.
+        seed: Seed of the subject.
     """
     from twofold.cli.demo import run_demo
 

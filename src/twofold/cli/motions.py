@@ -49,7 +49,7 @@ def motion(
     background: str = "#eceef3",
     body: str = "anny",
 ) -> None:
-    """Reports what a motion file holds, and previews it on the free body as a video.
+    """Report what a motion file holds, and preview it on the free body as a video.
 
     Args:
         source: A .bvh or .npz file (AMASS, SMPL, AIST++), or one of walk, turn, dance, range-of-motion.

@@ -116,7 +116,7 @@ def weights_by(
 def to_canonical(
     x_posed: Float[Tensor, "S 3"],
     nearest: Int[Tensor, "S K"],
-    shares: Float[Tensor, "S K"],
+    weights: Float[Tensor, "S K"],
     forward: Float[Tensor, "V 3 4"],
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 3"]]:
     r"""`inverse_skinning` with the weights of the nearest vertices, and the matrix for normals.
@@ -132,25 +132,25 @@ def to_canonical(
 
     Blending vertices' weights is blending their transforms, so the K rows are mixed and inverted once. With one
     neighbour the transforms are inverted at the vertices instead, of which there are fewer than samples. Which vertices
-    are nearest and their shares carry no gradient; the pose gets its gradient through `forward`.
+    are nearest and their weights carry no gradient; the pose gets its gradient through `forward`.
 
     Args:
         x_posed: points of observation space, metres.
         nearest: their K nearest posed vertices.
-        shares: weight of each of these.
+        weights: weight of each of these.
         forward: `vertex_transforms` of the posed body.
 
     Returns:
         canonical points, and J^-T of the skinning: a canonical gradient times it is the gradient in observation space.
     """
-    x_canonical, rows = map_to_canonical(x_posed, nearest, shares, forward)
+    x_canonical, rows = map_to_canonical(x_posed, nearest, weights, forward)
     return x_canonical, rows[..., :3].transpose(-1, -2)
 
 
 def map_to_canonical(
     x_posed: Float[Tensor, "S 3"],
     nearest: Int[Tensor, "S K"],
-    shares: Float[Tensor, "S K"],
+    weights: Float[Tensor, "S K"],
     forward: Float[Tensor, "V 3 4"],
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3 4"]]:
     r"""Canonical points as `to_canonical` gives them, and each sample's whole posed-to-canonical transform.
@@ -162,7 +162,7 @@ def map_to_canonical(
     >>> x_c, inverse[0, 0, [0, 3]]
     (tensor([[2., 0., 0.]]), tensor([ 0.5000, -0.5000]))
     """
-    rows = _inverse_rows(nearest, shares, forward)
+    rows = _inverse_rows(nearest, weights, forward)
     # A product of the whole batch with elementwise sums: batched 3x3 matrix products are slow on CPUs.
     return (rows[..., :3] * x_posed[:, None, :]).sum(-1) + rows[..., 3], rows
 
@@ -225,7 +225,7 @@ def with_pose_gradient(
 
 
 def normal_matrices(
-    nearest: Int[Tensor, "S K"], shares: Float[Tensor, "S K"], forward: Float[Tensor, "V 3 4"]
+    nearest: Int[Tensor, "S K"], weights: Float[Tensor, "S K"], forward: Float[Tensor, "V 3 4"]
 ) -> Float[Tensor, "S 3 3"]:
     r"""$J^{-\top}$ of `to_posed`: a canonical gradient times it is the gradient in observation space.
 
@@ -239,23 +239,23 @@ def normal_matrices(
     Args:
         nearest: the K nearest canonical vertices of canonical points. The release takes normals by these, though the
             posed vertex that carried a point into canonical space often is another one.
-        shares: weight of each of these.
+        weights: weight of each of these.
         forward: `vertex_transforms` of the posed body.
     """
-    return _inverse_rows(nearest, shares, forward)[..., :3].transpose(-1, -2)
+    return _inverse_rows(nearest, weights, forward)[..., :3].transpose(-1, -2)
 
 
-def _inverse_rows(nearest: Tensor, shares: Tensor, forward: Tensor) -> Tensor:
+def _inverse_rows(nearest: Tensor, weights: Tensor, forward: Tensor) -> Tensor:
     """Inverse of the mixed transforms, [S 3 4]; with one neighbour inverted at the vertices, which are fewer."""
     if nearest.shape[1] == 1:
-        return weighted_rows(invert_affine(forward).flatten(1), nearest, torch.ones_like(shares)).unflatten(-1, (3, 4))
-    return invert_affine(weighted_rows(forward.flatten(1), nearest, shares).unflatten(-1, (3, 4)))
+        return weighted_rows(invert_affine(forward).flatten(1), nearest, torch.ones_like(weights)).unflatten(-1, (3, 4))
+    return invert_affine(weighted_rows(forward.flatten(1), nearest, weights).unflatten(-1, (3, 4)))
 
 
 def to_posed(
     x_canonical: Float[Tensor, "S 3"],
     nearest: Int[Tensor, "S K"],
-    shares: Float[Tensor, "S K"],
+    weights: Float[Tensor, "S K"],
     forward: Float[Tensor, "V 3 4"],
 ) -> Float[Tensor, "S 3"]:
     r"""Forward skinning with the weights of the nearest canonical vertices.
@@ -270,8 +270,8 @@ def to_posed(
     Args:
         x_canonical: points of canonical space, metres.
         nearest: their K nearest canonical vertices.
-        shares: weight of each of these.
+        weights: weight of each of these.
         forward: `vertex_transforms` of the posed body.
     """
-    rows = weighted_rows(forward.flatten(1), nearest, shares).unflatten(-1, (3, 4))
+    rows = weighted_rows(forward.flatten(1), nearest, weights).unflatten(-1, (3, 4))
     return (rows[..., :3] * x_canonical[:, None, :]).sum(-1) + rows[..., 3]

@@ -30,7 +30,7 @@ class ReadyBranch:
 
 
 class BranchNetworks(nn.Module):
-    """Distance and colour network of one branch, and the linear maps that shorten what its colour network is told.
+    """Distance and colour network of one branch, and the linear maps that shorten its colour network's inputs.
 
     Args:
         sdf: of the distance network; its constants are the pose, or none.

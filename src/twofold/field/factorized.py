@@ -40,7 +40,7 @@ class FactorizedFieldConfig:
         sdf_head: tanh over the outputs of the distance networks, or none.
         color_sees_position: the colour networks also see x.
         normals: whose normals the colour networks see, those of observation space or of canonical space.
-        pose_code: the colour network sees a linear map of the pose to so many numbers; None shows it the pose.
+        pose_code: the colour network sees a linear map of the pose to this many numbers; None: the pose itself.
         feature_code: the same for the base branch's colour feature; None shows all of it.
         width: units of every hidden layer, and of each feature vector.
         low_sdf_depth: hidden layers of the base branch's distance network.
@@ -145,7 +145,7 @@ class FactorizedField(nn.Module):
 
         Args:
             x_canonical: points, metres.
-            pose: what the pose-dependent networks are told; the released program gives the 69 body angles over pi.
+            pose: what the pose-dependent networks are conditioned on; as released, the 69 body angles over pi.
             to_observation: M, with the normal of observation space along M times the canonical gradient; for points
                 moved by a matrix J that is the inverse transpose of J. None leaves normals canonical.
         """

@@ -236,7 +236,7 @@ class GridField(nn.Module):
 
         Args:
             x: points of canonical space, metres.
-            pose: what the pose-dependent branch is told.
+            pose: what the pose-dependent branch is conditioned on.
             to_observation: turns canonical gradients into those of observation space; None leaves them.
         """
         # Normals enter the colours as constants: the shape learns from densities, at half the cost.

@@ -298,8 +298,8 @@ def body_distance(
     distance, nearest = nearest_vertices(x, corners, k=min(6, len(corners)))
     normals = vertex_normals(corners, torch.from_numpy(faces))
     along = ((x[:, None] - corners[nearest]) * normals[nearest]).sum(-1)
-    shares = 1 / distance.clamp_min(1e-4) ** 2
-    mean = (along * shares).sum(-1) / shares.sum(-1)
+    weights = 1 / distance.clamp_min(1e-4) ** 2
+    mean = (along * weights).sum(-1) / weights.sum(-1)
     # Close to the surface the projection is the distance; further out the nearest vertex says how far.
     far = mean.sign() * distance[:, 0]
     return torch.where(distance[:, 0] < 0.02, mean, far).float().numpy()

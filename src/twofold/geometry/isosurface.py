@@ -30,7 +30,7 @@ def extract_surface(
 ) -> tuple[Float[Tensor, "W 3"], Int[Tensor, "F 3"]]:
     """The surface where `level` is zero: the connected piece of largest area, triangles counter-clockwise from outside.
 
-    The field is asked on a grid of double width, where that is near the body, and on the fine grid only in those cells
+    It is queried on a grid of double width, where that is near the body, and on the fine grid only in those cells
     that may hold surface: a tenth of the points that the box around a person would have.
 
     Args:

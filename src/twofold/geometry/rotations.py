@@ -16,7 +16,7 @@ def axis_angle_to_matrix(axis_angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b
     angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
     # Taylor series near zero keep both the value and its derivative finite.
     first = torch.where(small, 1 - squared / 6, angle.sin() / angle)
-    # (1 - cos) / angle^2 without the cancellation that spoils its derivative in single precision.
+    # (1 - cos) / angle^2 without the cancellation that degrades its derivative in single precision.
     second = torch.where(small, 0.5, 2 * ((angle / 2).sin() / angle).square())
     cross = cross_matrix(axis_angle)
     identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)

@@ -19,7 +19,7 @@ def flush_denormals() -> None:
     import numpy as np
     import torch
 
-    # NumPy 1 measures its number types when they are first asked for, and wonders aloud where these numbers are.
+    # NumPy 1 measures its number types when they are first asked for, and warns where these numbers are.
     for kind in (np.float16, np.float32, np.float64, np.longdouble):
         np.finfo(kind)
     torch.set_flush_denormal(True)

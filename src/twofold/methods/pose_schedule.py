@@ -14,7 +14,7 @@ from twofold.losses import MOST_STEPS
 
 @dataclass(frozen=True)
 class PoseConfig:
-    """What the pose-dependent branch is told, and which poses are corrected while training."""
+    """What the pose-dependent branch is conditioned on, and which poses are corrected while training."""
 
     divide_by_pi: bool = True
     with_root: bool = False

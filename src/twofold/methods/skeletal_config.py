@@ -47,7 +47,7 @@ class SkeletalConfig:
     guard_frames: int = 16
     """How many frames are looked at."""
     guard_size: int | None = None
-    """The longer side of the pictures that are looked at, pixels; none: as they are."""
+    """The longer side of the images that are looked at, pixels; none: as they are."""
     level_density: float = 15.0
     """Density times likelihood on the surface of meshes, per metre."""
 

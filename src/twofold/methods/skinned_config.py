@@ -30,7 +30,7 @@ class SkinnedConfig(MethodConfig):
     late_neighbours: int | None = None
     """The same in training from epoch `late_from` on; 7 in the release, whose validation changes it."""
     late_from: int = 100
-    """Epochs before that; every so many epochs the canonical body that turns normals follows the corrected shape."""
+    """Epochs before that; every that many epochs the canonical body that turns normals follows the corrected shape."""
     falloff: Literal["exponential", "scene", "smooth"] = "exponential"
     """How these count by distance: "exponential", nearly alike in metres; "scene", so in scene units, as released;
     "smooth", down to nothing at the last of them, so that points beside each other move alike."""
@@ -93,7 +93,7 @@ class SkinnedPose:
         surface: the posed body with its shell.
         condition: the pose vector that the field is conditioned on.
         anchors: canonical vertices that turn normals, where these are not the ones that inverse skinning found.
-        row: of the training moment that the pose belongs to, or None.
+        row: of the training frame that the pose belongs to, or None.
     """
 
     surface: PosedSurface

@@ -250,7 +250,7 @@ class Vid2Avatar(SkinnedAvatar[Vid2AvatarConfig, ImplicitField]):
 
         Args:
             rays: from within the sphere; their bounds do not matter.
-            posed: its moment chooses the code; a pose that is no training moment takes the mean of all codes.
+            posed: its frame chooses the code; a pose that is no training frame takes the mean of all codes.
             generator: moves samples within their strata.
         """
         if self.scene is None:
@@ -275,7 +275,7 @@ class Vid2Avatar(SkinnedAvatar[Vid2AvatarConfig, ImplicitField]):
         return (rays.origins - middle) * self.subject.scene_scale
 
     def _middle(self, row: int) -> Tensor:
-        """Middle of the sphere at a training moment, by its pose as given."""
+        """Middle of the sphere at a training frame, by its pose as given."""
         if self.config.center == "world":
             return self.middle.cpu()
         if row not in self._middles:

@@ -1,6 +1,6 @@
 """How close a rendered image is to a photograph: PSNR, SSIM, silhouette overlap.
 
-Every figure is of the images as they are stored in 8 bit, rounded unless truncation is asked for, so it can be
+Every metric is of the images as they are stored in 8 bit, rounded unless truncation is asked for, so it can be
 measured again from the PNG files. Images hold colours in 0..1.
 """
 
@@ -94,7 +94,7 @@ def ssim(
     $$\mathrm{SSIM} = \frac{(2 \mu_x \mu_y + c_1)(2 \sigma_{xy} + c_2)}
     {(\mu_x^2 + \mu_y^2 + c_1)(\sigma_x^2 + \sigma_y^2 + c_2)}, \quad c_1 = (0.01 L)^2, \; c_2 = (0.03 L)^2$$
 
-    with the data range $L$. Moments are over the windows that lie in the image whole. The uniform window has 7 x 7
+    with the data range $L$. Frames are over the windows that lie in the image whole. The uniform window has 7 x 7
     pixels and unbiased covariances (times 49/48), as scikit-image has them; the Gaussian one 11 x 11 with a standard
     deviation of 1.5 pixels and covariances as they are, as in the publication and in torchmetrics.
 
@@ -267,7 +267,7 @@ def compare(
     mask: Float[Tensor, "h w"],
     ignored: Bool[Tensor, "h w"] | None = None,
 ) -> dict[str, float]:
-    """All figures of one image, named as in `PROTOCOLS`; pixels that are `ignored` count in none of them."""
+    """All metrics of one image, named as in `PROTOCOLS`; pixels that are `ignored` count in none of them."""
     if ignored is not None and not ignored.any():
         ignored = None
     if min(image[subject_box(mask)].shape[:2]) < SSIM_WINDOW:

@@ -1,7 +1,7 @@
 """How close a reconstructed surface is to the true one: Chamfer distance and normal consistency.
 
 Distances to a surface are measured to its triangles, not to a cloud of points on it: with a cloud of 30,000 points on a
-person the nearest point lies some 4 mm away on average even where two surfaces coincide, so the figure could never fall
+person the nearest point lies some 4 mm away on average even where two surfaces coincide, so the metric could never fall
 below that.
 """
 
@@ -107,7 +107,7 @@ def compare_surfaces(
     samples: int = SAMPLES,
     seed: int = 0,
 ) -> dict[str, float]:
-    """All figures of one reconstructed mesh against the true one, named as in `PROTOCOLS`; vertices in metres.
+    """All metrics of one reconstructed mesh against the true one, named as in `PROTOCOLS`; vertices in metres.
 
     Raises:
         TwofoldError: a mesh is empty or has a vertex that is not finite.

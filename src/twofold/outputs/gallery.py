@@ -148,7 +148,7 @@ def render_run(
         what: "all", "orbit", "views", "poses" or "canonical".
         size: edge of orbit and canonical images, pixels.
         chunk: rays at once; None as many as memory allows.
-        show: told the share that is done.
+        show: called with the fraction that is done.
         views: images of the orbit.
 
     Raises:

@@ -33,7 +33,7 @@ def mesh_renderer(
         capture: that it was trained on, for the poses whose colours are averaged.
         motion: what it does.
         config: of the mesh.
-        progress: called with the share that is done and what comes next.
+        progress: called with the fraction that is done and what comes next.
 
     Raises:
         TwofoldError: see `bake`.

@@ -137,7 +137,7 @@ def write_motion(
         renderer: of the motion's frames.
         background: colour behind, 0..1.
         alpha: keep the opacity instead of a background.
-        progress: called with the share that is done.
+        progress: called with the fraction that is done.
         replace: overwrite a folder that holds files.
 
     Raises:

@@ -33,7 +33,7 @@ class Given:
 
     Attributes:
         masks: their own masks.
-        landmarks: their own landmarks of every image of the clip, in words and pixels of straightened images, for each
+        landmarks: their own landmarks of every image of the clip, in words and pixels of undistorted images, for each
             way to read their numbers; the likeliest first.
         motion: their own poses, of every image of the clip.
     """
@@ -56,7 +56,7 @@ def read_given(ready: Sequence[Clip], config: PrepareConfig, body: Body) -> list
             masks = masks_from_folder(_piece(config.masks, clip, len(ready)), clip.info)
         if config.landmarks is not None:
             place = _piece(config.landmarks, clip, len(ready))
-            landmarks = [(words, _straightened(track, clip)) for words, track in landmark_readings(place, clip.info)]
+            landmarks = [(words, _undistorted(track, clip)) for words, track in landmark_readings(place, clip.info)]
             require_person(landmarks[0][1], str(config.landmarks), advice(config, LARGER, ("landmarks",)))
         motion = None
         if config.poses is not None:
@@ -75,7 +75,7 @@ def _piece(place: Path, clip: Clip, clips: int) -> Path:
     return found[0]
 
 
-def _straightened(track: Track, clip: Clip) -> Track:
+def _undistorted(track: Track, clip: Clip) -> Track:
     if clip.lens is None:
         return track
     return replace(track, pixels=undistort(clip.lens, track.pixels.astype(np.float64)).astype(np.float32))

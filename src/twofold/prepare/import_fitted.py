@@ -62,14 +62,14 @@ def import_prepared(
     Args:
         source: the prepared folder.
         out: the capture folder to make.
-        every_held_out: of so many frames one is held out, the one in the middle, so that its neighbours train.
+        every_held_out: every Nth frame is held out, the middle one of N, so that its neighbours train.
         drop_below_iou: frames whose fitted body covers the mask worse than this are in no split; the notes name them.
-        overwrite: a capture that lies at `out` gives way.
+        overwrite: a capture that lies at `out` is overwritten.
         held_objects: "remove" takes what is thick and sticks out of the body, such as a ball, out of the masks, and
             marks it and what passes in front of the body as ignored; "keep" leaves the masks as they are.
         fps: frames per second; None takes `fps` of capture.npz, else 30, and says so.
         credit: whom to name when showing the images.
-        remark: told each sentence that the user should know.
+        remark: called with each sentence that the user should know.
 
     Returns:
         `out`.
@@ -206,7 +206,7 @@ def _as_stored(file: Path, values: MaskValues) -> bool:
 
 @contextlib.contextmanager
 def _named_as_given(images: dict[int, Path], masks: dict[int, Path]) -> Generator[None, None, None]:
-    """Faults of images under the names that they have in the prepared folder, where they can be mended."""
+    """Faults of images under the names that they have in the prepared folder, where they can be fixed."""
     try:
         yield
     except TwofoldError as error:

@@ -111,9 +111,9 @@ def prepare(
         body: to fit.
         estimator: makes a new estimator for each clip.
         config: options.
-        show: told the share that is done and what is being done.
+        show: called with the fraction that is done and what is being done.
         people: counts who is in view; None to trust that it is one person.
-        overwrite: a capture that lies at `out` gives way.
+        overwrite: a capture that lies at `out` is overwritten.
         finder: finds everybody in an image, where one of several people is chosen.
 
     Raises:
@@ -178,12 +178,12 @@ def _watch_all(
     watched: list[Watched] = []
     remarks: list[str] = []
     for k, (clip, own) in enumerate(zip(ready, given, strict=True)):
-        straighten = None if clip.lens is None else undistorter(clip.lens, clip.info.height, clip.info.width)
+        undistort = None if clip.lens is None else undistorter(clip.lens, clip.info.height, clip.info.width)
         found = estimator()
         try:
             with region_finder(own, clip, body, config, finder) as region:
                 seen = watch_clip(
-                    clip.frames, clip.info.frames, found, scratch / clip.name, straighten,
+                    clip.frames, clip.info.frames, found, scratch / clip.name, undistort,
                     [] if own.masks is None else own.masks.readings(),
                     lambda done, k=k: show(0.3 * (k + done) / len(ready), "looking at the images"), region,
                 )  # fmt: skip
@@ -191,7 +191,7 @@ def _watch_all(
             found.close()
         if own.masks is not None and own.masks.others:
             masks, sentence = chosen_masks(own.masks, seen.overlaps)
-            seen = with_masks(seen, masks, straighten)
+            seen = with_masks(seen, masks, undistort)
             remarks.append(sentence)
         remarks += [f"{clip.name}: {remark}" for remark in clip.frames.remarks]
         if seen.repeated:

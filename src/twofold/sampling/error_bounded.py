@@ -67,7 +67,7 @@ def samples_between(depths: Float[Tensor, "R n"]) -> Samples:
 
 
 def invert(
-    depths: Float[Tensor, "R n"], shares: Float[Tensor, "R m"], quantiles: Float[Tensor, "R q"]
+    depths: Float[Tensor, "R n"], weights: Float[Tensor, "R m"], quantiles: Float[Tensor, "R q"]
 ) -> Float[Tensor, "R q"]:
     r"""Depths at quantiles of a distribution that is constant within each section (inverse transform sampling).
 
@@ -80,12 +80,12 @@ def invert(
 
     Args:
         depths: n ascending ends of the m = n - 1 sections.
-        shares: positive weight of each section, of any sum.
+        weights: positive weight of each section, of any sum.
         quantiles: in 0..1.
     """
-    cumulative = torch.cumsum(shares / shares.sum(-1, keepdim=True), -1)
+    cumulative = torch.cumsum(weights / weights.sum(-1, keepdim=True), -1)
     cumulative = torch.cat([torch.zeros_like(cumulative[:, :1]), cumulative], -1)
-    section = torch.searchsorted(cumulative, quantiles, right=True).clamp(1, shares.shape[-1]) - 1
+    section = torch.searchsorted(cumulative, quantiles, right=True).clamp(1, weights.shape[-1]) - 1
     below, above = cumulative.gather(1, section), cumulative.gather(1, section + 1)
     start, end = depths.gather(1, section), depths.gather(1, section + 1)
     # A section of (nearly) no share holds its quantile at its start.
@@ -281,15 +281,15 @@ class ErrorBoundedSampler:
 
     def _refined_depths(self, depths: Tensor, distances: Tensor, scale: Tensor) -> Tensor:
         delta = depths.diff(dim=1)
-        shares = error_bound(delta, distances, surface_clearance(delta, distances), scale) + PDF_FLOOR
-        return invert(depths, shares, _even_quantiles(self.refined, depths))
+        weights = error_bound(delta, distances, surface_clearance(delta, distances), scale) + PDF_FLOOR
+        return invert(depths, weights, _even_quantiles(self.refined, depths))
 
     def _shaded_depths(
         self, rays: Rays, depths: Tensor, distances: Tensor, scale: Tensor, generator: torch.Generator | None
     ) -> Tensor:
         delta = depths.diff(dim=1)
         optical = _optical_lengths(delta, distances, scale)
-        shares = torch.exp(optical - optical.cumsum(1)) * -torch.expm1(-optical) + FINAL_FLOOR
+        weights = torch.exp(optical - optical.cumsum(1)) * -torch.expm1(-optical) + FINAL_FLOOR
         count = depths.shape[1]
         if generator is None:
             quantiles = _even_quantiles(self.shaded, depths)
@@ -301,7 +301,7 @@ class ErrorBoundedSampler:
         if self.ends == "released":
             near, far = torch.zeros_like(near), torch.full_like(far, 6)
         seen = depths[:, chosen.to(depths.device)]
-        return torch.cat([near, far, seen, invert(depths, shares, quantiles)], 1).sort(1).values
+        return torch.cat([near, far, seen, invert(depths, weights, quantiles)], 1).sort(1).values
 
 
 def error_bound(

@@ -161,7 +161,7 @@ def sample_shell(
         shell: where to sample.
         rays: their near and far bounds are respected.
         step: metres.
-        generator: moves each ray's comb of samples by a random part of a step; None puts samples at mid-step.
+        generator: shifts each ray's evenly spaced samples by a random part of a step; None puts samples at mid-step.
         limit: largest distance to the nearest vertex, metres, at most the shell's radius.
 
     Returns:

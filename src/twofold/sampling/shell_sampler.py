@@ -55,7 +55,7 @@ class ShellSampler:
         return self.radius
 
     def shell(self, body: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], neighbours: int) -> Shell:
-        """The shell around a body, with enough candidates for so many neighbours."""
+        """The shell around a body, with enough candidates for that many neighbours."""
         return build_shell(body, faces, self.radius, self.voxel, max(6, 2 * neighbours))
 
     def ray_box(

@@ -64,7 +64,7 @@ def survey(shaped: ShapedBody) -> Anatomy:
 
 
 def _outer_parts(shaped: ShapedBody) -> tuple[torch.Tensor, Float[np.ndarray, "2 3"]]:
-    """Faces of the body and its eyeballs (no tongue, no teeth), and where the eyes are."""
+    """Faces of the body and its eyeballs (no inside of the mouth), and where the eyes are."""
     faces = shaped.faces.numpy()
     vertices = shaped.vertices.numpy()
     count = len(vertices)

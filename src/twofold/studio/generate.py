@@ -1,7 +1,7 @@
 """Studio captures: made people with known truth.
 
 A person is drawn from a seed (body, clothes, hair, face), moves in front of a ring of cameras under light that stays
-fixed, and is pictured exactly: the poses, the cameras and the surface of every test frame are the very ones used.
+fixed, and is rendered exactly: the poses, the cameras and the surface of every test frame are the very ones used.
 """
 
 import os
@@ -29,7 +29,7 @@ from twofold.geometry.surfaces import vertex_normals
 from twofold.studio.appearance import Look, draw_look
 from twofold.studio.figure import Figure, build_figure
 from twofold.studio.lighting import Beads, cast_shade, illuminate, thread_beads
-from twofold.studio.scene import ring, room, spoil_mask
+from twofold.studio.scene import degrade_mask, ring, room
 from twofold.studio.texture import paint
 from twofold.studio.wrinkles import Fold, displacement, lay_folds
 
@@ -199,7 +199,7 @@ def make_studio(
     Args:
         config: what to make.
         out: the folder to write; it must not exist, or be empty.
-        progress: is told the share done, 0..1.
+        progress: called with the fraction done, 0..1.
         overwrite: a capture in `out` without any other files is overwritten once the new one is complete.
 
     Raises:
@@ -295,7 +295,7 @@ def _film(
             if name in rooms:
                 color = color + (1 - mask[..., None]) * rooms[name]
             random = np.random.default_rng([config.seed, 5, time, list(cameras).index(name)])
-            mask = spoil_mask(mask, project(cameras[name], hands)[0].numpy(), config.mask_noise, random)
+            mask = degrade_mask(mask, project(cameras[name], hands)[0].numpy(), config.mask_noise, random)
             writer.image(name, time, _eight_bit(color))
             writer.mask(name, time, _eight_bit(mask))
         with lock:

@@ -78,7 +78,7 @@ def room(camera: Camera, seed: int) -> Float[np.ndarray, "h w 3"]:
     return picture.reshape(camera.height, 2, camera.width, 2, 3).mean((1, 3)).astype(np.float32)
 
 
-def spoil_mask(
+def degrade_mask(
     mask: Float[np.ndarray, "h w"], hands: Float[np.ndarray, "k 2"], strength: float, random: np.random.Generator
 ) -> Float[np.ndarray, "h w"]:
     """A mask as an estimator makes it: ragged, hard edges, at times without a hand or with a piece of the room.

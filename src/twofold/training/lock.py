@@ -37,7 +37,7 @@ def locked(folder: Path, doing: str = "trained") -> Generator[None, None, None]:
     handle = _taken(path)
     if handle is None:
         raise TwofoldError(
-            f"{folder} is being {doing} by another process at this moment; wait until it ends, or choose another "
+            f"{folder} is being {doing} by another process right now; wait until it ends, or choose another "
             "folder with --out."
         )
     try:

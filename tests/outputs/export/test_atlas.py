@@ -44,9 +44,9 @@ def test_texels_show_positions_on_their_own_triangle(ball, atlas, segments: int)
     for face in range(0, len(faces), 11):
         uv = atlas.uv[atlas.faces[face]].astype(float) * SIZE
         row, column = (np.floor(uv.mean(0)[::-1])).astype(int)
-        shares = np.linalg.solve(np.vstack([uv.T, np.ones(3)]), [column + 0.5, row + 0.5, 1])
-        if (shares > 0).all():
-            assert np.abs(image[row, column] - shares @ vertices[faces[face]]).max() < 1e-4
+        barycentric = np.linalg.solve(np.vstack([uv.T, np.ones(3)]), [column + 0.5, row + 0.5, 1])
+        if (barycentric > 0).all():
+            assert np.abs(image[row, column] - barycentric @ vertices[faces[face]]).max() < 1e-4
             checked += 1
     assert checked > 10
     assert known.any()

@@ -19,10 +19,10 @@ MIRROR = list(mirrored_landmarks())
 
 
 def look(frames, lens=None):
-    straighten = None if lens is None else undistorter(lens, frames.info.height, frames.info.width)
+    undistort = None if lens is None else undistorter(lens, frames.info.height, frames.info.width)
     estimator = mediapipe_estimator(masks=False)
     try:
-        return track_of([estimator(p.image if straighten is None else straighten(p.image), p.seconds) for p in frames])
+        return track_of([estimator(p.image if undistort is None else undistort(p.image), p.seconds) for p in frames])
     finally:
         estimator.close()
 

@@ -6,18 +6,18 @@ from types import ModuleType
 import pytest
 
 from twofold.errors import TwofoldError
-from twofold.prepare.detect.mediapipe_loader import load_mediapipe, quiet
+from twofold.prepare.detect.mediapipe_loader import load_mediapipe, silenced
 
 
 def test_what_compiled_code_prints_is_swallowed(capfd):
-    with quiet():
+    with silenced():
         os.write(2, b"noise")
     os.write(2, b"news")
     assert capfd.readouterr().err == "news"
 
 
 def test_an_error_is_passed_on_and_standard_error_comes_back(capfd):
-    with pytest.raises(ValueError, match="mine"), quiet():
+    with pytest.raises(ValueError, match="mine"), silenced():
         raise ValueError("mine")
     os.write(2, b"news")
     assert capfd.readouterr().err == "news"
@@ -25,14 +25,14 @@ def test_an_error_is_passed_on_and_standard_error_comes_back(capfd):
 
 def test_a_program_without_standard_error_goes_on(monkeypatch):
     monkeypatch.setattr(sys, "stderr", None)
-    with quiet():
+    with silenced():
         pass
 
 
 def test_no_file_stays_open():
     before = len(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else 0
     for _ in range(20):
-        with quiet():
+        with silenced():
             pass
     assert (len(os.listdir("/proc/self/fd")) if before else 0) <= before
 

@@ -149,9 +149,9 @@ def test_images_masks_and_landmarks_are_put_aside(tmp_path):
     )
 
 
-def test_images_are_straightened_before_anybody_looks(tmp_path):
+def test_images_are_undistorted_before_anybody_looks(tmp_path):
     finder = Finder()
-    seen = watch_clip(pictures(3), 3, finder, tmp_path, straighten=lambda image: image // 2)
+    seen = watch_clip(pictures(3), 3, finder, tmp_path, undistort=lambda image: image // 2)
     plain = Finder()
     watch_clip(pictures(3), 3, plain, tmp_path / "plain")
     for (dark, *_), (bright, *_) in zip(finder.shown, plain.shown, strict=True):

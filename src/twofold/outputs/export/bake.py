@@ -26,10 +26,10 @@ class BakeConfig:
     """What a character is made of.
 
     Attributes:
-        faces: about so many triangles.
+        faces: number of triangles, roughly.
         branch: whose surface, the full field's or the base branch's.
-        targets: at most so many morph targets.
-        frames: at most so many training frames are taken for the morph targets.
+        targets: at most this many morph targets.
+        frames: at most this many training frames are taken for the morph targets.
         color_frames: frames over which the colour is averaged.
         texture: edge of the texture, texels; 0 for vertex colours.
         lit: keep the capture's light in the colours, also where the method knows it.
@@ -117,7 +117,7 @@ def bake_shape(
         avatar: trained.
         frames: training poses, in the order of time.
         config: see there.
-        progress: told the share that is done and what comes next.
+        progress: called with the fraction that is done and what comes next.
 
     Raises:
         TwofoldError: the field has no surface, or a package is missing.

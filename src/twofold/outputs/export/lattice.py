@@ -1,6 +1,6 @@
-"""Points spread over every triangle of a mesh, shared along edges: where a field is asked for what a texture shows.
+"""Points spread over every triangle of a mesh, shared along edges: where a field is queried for what a texture shows.
 
-A texture has millions of texels, a field of a person changes over millimetres. So the field is asked at the nodes of a
+A texture has millions of texels, a field of a person changes over millimetres. So it is queried at the nodes of a
 lattice in each triangle and interpolated between; nodes on an edge belong to both of its triangles, so nothing changes
 across edges, nor across the seams of an atlas.
 """
@@ -20,14 +20,14 @@ class TriangleLattice:
     Attributes:
         segments: parts of an edge.
         corners: the three vertices that each node lies between; the mesh's own vertices are the first nodes.
-        shares: barycentric weights of these.
+        barycentric: barycentric weights of these.
         table: of each triangle the nodes, by rows: node (i, j), `i + j <= segments`, has the barycentric weights
             i / segments and j / segments of the second and third corner.
     """
 
     segments: int
     corners: Int[Tensor, "N 3"]
-    shares: Float[Tensor, "N 3"]
+    barycentric: Float[Tensor, "N 3"]
     table: Int[np.ndarray, "F L"]
 
     def __len__(self) -> int:
@@ -35,13 +35,13 @@ class TriangleLattice:
 
     def interpolate(self, values: Float[Tensor, "V *c"]) -> Float[Tensor, "N *c"]:
         """Values at the nodes, from those at the vertices."""
-        shares = self.shares.reshape(*self.shares.shape, *[1] * (values.dim() - 1))
-        parts = (shares[:, corner] * values[self.corners[:, corner]] for corner in range(3))
+        barycentric = self.barycentric.reshape(*self.barycentric.shape, *[1] * (values.dim() - 1))
+        parts = (barycentric[:, corner] * values[self.corners[:, corner]] for corner in range(3))
         return torch.stack(list(parts)).sum(0)
 
 
 def build_lattice(vertices: int, faces: Int[np.ndarray, "F 3"], segments: int) -> TriangleLattice:
-    """The lattice of a mesh with so many vertices.
+    """The lattice of a mesh with `vertices` vertices.
 
     >>> lattice = build_lattice(4, np.array([[0, 1, 2], [2, 1, 3]]), 2)
     >>> len(lattice), lattice.table.shape
@@ -67,14 +67,14 @@ def build_lattice(vertices: int, faces: Int[np.ndarray, "F 3"], segments: int) -
         else:
             table[:, place] = first_inside + np.arange(len(faces)) * len(inside) + inside.index((i, j))
     count = first_inside + len(faces) * len(inside)
-    corners, shares = np.zeros((count, 3), dtype=np.int64), np.zeros((count, 3), dtype=np.float32)
+    corners, barycentric = np.zeros((count, 3), dtype=np.int64), np.zeros((count, 3), dtype=np.float32)
     for place, (i, j) in enumerate(local):
         corners[table[:, place]] = faces
-        shares[table[:, place]] = np.array([segments - i - j, i, j], dtype=np.float32) / segments
-    unused = shares.sum(1) == 0
-    shares[unused, 0] = 1
+        barycentric[table[:, place]] = np.array([segments - i - j, i, j], dtype=np.float32) / segments
+    unused = barycentric.sum(1) == 0
+    barycentric[unused, 0] = 1
     corners[unused] = np.arange(count)[unused, None].clip(max=vertices - 1)
-    return TriangleLattice(segments, torch.from_numpy(corners), torch.from_numpy(shares), table)
+    return TriangleLattice(segments, torch.from_numpy(corners), torch.from_numpy(barycentric), table)
 
 
 def segments_for(vertices: int, faces: int, budget: int, most: int = 6) -> int:

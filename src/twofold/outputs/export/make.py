@@ -19,7 +19,7 @@ from twofold.outputs.export.morphs import PulledBack, pull_back
 from twofold.outputs.export.observed import observed_share
 
 QUERIES = 3_000_000
-"""Points that the field is asked for the colours of one character, over all poses."""
+"""Points that the field is queried for the colours of one character, over all poses."""
 _NORMAL_FRAMES = 4
 
 Shown = Sequence[tuple[PosedAvatar, PulledBack]]
@@ -87,7 +87,7 @@ def bake(
         color: "full" for the mean of the full field over some training poses, "base" for that of the base branch, or a
             frame's index for the full field in that frame's pose.
         name: of the character.
-        progress: told the share that is done and what comes next.
+        progress: called with the fraction that is done and what comes next.
 
     Raises:
         TwofoldError: there is no such frame, no surface, or a package is missing.

@@ -19,7 +19,7 @@ _OFF = 0.002
 _MISPLACED = 0.04
 _ROUNDS = 15
 LEFT_OUT = 5
-"""Every so many frames one is left out, to measure how targets do on frames that they were not fitted to."""
+"""Every Nth frame is left out, to measure how targets do on frames that they were not fitted to."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def fit_morphs(displacements: Float[Tensor, "T V 3"], found: Bool[Tensor, "T V"]
     Args:
         displacements: of the frames, metres.
         found: where they hold; elsewhere the mean of the other frames stands in.
-        count: at most so many targets.
+        count: at most this many targets.
     """
     known = found[..., None].to(displacements.dtype)
     mean = (displacements * known).sum(0) / known.sum(0).clamp_min(1)

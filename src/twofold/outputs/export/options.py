@@ -1,4 +1,4 @@
-"""What every exporter may be told."""
+"""Options of every exporter."""
 
 from dataclasses import dataclass
 from typing import Literal

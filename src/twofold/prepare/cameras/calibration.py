@@ -204,12 +204,12 @@ def undistorter(
     across, down = 2 * source[..., 0] / max(width - 1, 1) - 1, 2 * source[..., 1] / max(height - 1, 1) - 1
     where = torch.as_tensor(np.stack([across, down], -1)[None].astype(np.float32))
 
-    def straighten(picture: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
+    def undistort(picture: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
         planes = torch.as_tensor(picture.astype(np.float32)).permute(2, 0, 1)[None]
         moved = torch.nn.functional.grid_sample(planes, where, padding_mode="border", align_corners=True)
         return moved[0].permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).numpy()
 
-    return straighten
+    return undistort
 
 
 def _grid(rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "h w 2"]:

@@ -21,10 +21,10 @@ _PAIRS = 28
 """Pairs of views that are tried: all of eight cameras."""
 
 _INDEPENDENT = 40
-"""A view's landmarks are wrong together, the same ones in each frame: they count as so many of independent error."""
+"""A view's landmarks are wrong together, the same ones in each frame: they count as this many of independent error."""
 
 _TRUST = 2.0
-"""Errors of so many times the usual one still count for a quarter."""
+"""Errors of this many times the usual one still count for a quarter."""
 
 _ENOUGH = 20_000
 """Landmarks, over all views, that tell how cameras are turned."""

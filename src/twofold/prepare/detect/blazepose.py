@@ -6,7 +6,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import UInt8
 
-from twofold.prepare.detect.mediapipe_loader import load_mediapipe, quiet
+from twofold.prepare.detect.mediapipe_loader import load_mediapipe, silenced
 from twofold.prepare.detections import Estimator, Observation, nobody
 
 
@@ -39,7 +39,7 @@ class _BlazePose:
         if self._heard_all:
             found = self._process(image, seconds)
         else:
-            with quiet():
+            with silenced():
                 found = self._process(image, seconds)
         if found.pose_landmarks is None:
             return nobody(*image.shape[:2])

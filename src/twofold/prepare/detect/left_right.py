@@ -32,7 +32,7 @@ _JITTER = 0.08
 """What an estimator adds to these lines, trunk lengths."""
 
 _INDEPENDENT = 4.0
-"""The nine lines move together: they count as so many of independent error."""
+"""The nine lines move together: they count as this many of independent error."""
 
 _PAIRED = np.isin(np.arange(len(LANDMARKS)), np.concatenate([_LEFT, _RIGHT]))
 

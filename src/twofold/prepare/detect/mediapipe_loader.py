@@ -1,4 +1,4 @@
-"""MediaPipe, kept quiet: it is optional and talkative."""
+"""MediaPipe without its log output; it is optional."""
 
 import contextlib
 import importlib
@@ -19,7 +19,7 @@ def load_mediapipe() -> ModuleType:
         TwofoldError: it is not installed, or is a later version, which brings no models.
     """
     try:
-        with quiet():
+        with silenced():
             module = importlib.import_module("mediapipe")
     except ImportError as error:
         raise TwofoldError(f"Finding people in images needs MediaPipe 0.10.21; {_ADVICE}.") from error
@@ -30,7 +30,7 @@ def load_mediapipe() -> ModuleType:
 
 
 @contextlib.contextmanager
-def quiet() -> Generator[None]:
+def silenced() -> Generator[None]:
     """Meanwhile, what compiled libraries print on standard error goes nowhere; so does all else there."""
     with contextlib.ExitStack() as undo:
         with contextlib.suppress(OSError, AttributeError, ValueError):  # A program may have no standard error.

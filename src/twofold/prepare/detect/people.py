@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from twofold.prepare.detect.mediapipe_loader import load_mediapipe, quiet
+from twofold.prepare.detect.mediapipe_loader import load_mediapipe, silenced
 
 COMPARABLE = 0.6
 """Whoever is this large beside the largest person counts."""
@@ -96,7 +96,7 @@ def people_finder() -> Generator[Callable[[UInt8[np.ndarray, "_ _ 3"]], list[Per
     load_mediapipe()
     solutions: Any = importlib.import_module("mediapipe.python.solution_base")
     kinds = {"people": solutions.PacketDataType.PROTO_LIST}
-    with quiet():  # It speaks at the start and at the first image.
+    with silenced():  # It speaks at the start and at the first image.
         detector = solutions.SolutionBase(graph_config=_DETECTOR, outputs=["people"], stream_type_hints=kinds)
         detector.process(np.zeros((_HEIGHT, _HEIGHT, 3), np.uint8))
     try:

@@ -27,7 +27,7 @@ _SAMPLES, _VIEWS = 12, 40
 _QUALITY = 95
 """Of the stored images; video has lost more already."""
 
-Straighten = Callable[[UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "h w 3"]]
+Undistort = Callable[[UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "h w 3"]]
 Own = Callable[[int], UInt8[np.ndarray, "h w"] | None]
 
 
@@ -73,7 +73,7 @@ def watch_clip(
     expected: int,
     estimator: Estimator,
     scratch: Path,
-    straighten: Straighten | None = None,
+    undistort: Undistort | None = None,
     given: Sequence[Own] = (),
     show: Callable[[float], None] | None = None,
     region: Callable[[UInt8[np.ndarray, "h w 3"], int], Region | None] | None = None,
@@ -85,11 +85,11 @@ def watch_clip(
         expected: about how many there are.
         estimator: finds the person.
         scratch: folder for the files.
-        straighten: takes the lens's distortion out of an image.
+        undistort: takes the lens's distortion out of an image.
         given: the user's own mask of an image by its `source`, None where there is none; taken as it is. Where several
             readings are given the estimator's masks are kept, to choose by (`with_masks`).
-        show: told the share that is done.
-        region: where the person is in a straightened image with its `source`, None for anywhere. By default around
+        show: called with the fraction that is done.
+        region: where the person is in an undistorted image with its `source`, None for anywhere. By default around
             the user's own mask; where an image has none, around the last one.
 
     Raises:
@@ -112,8 +112,8 @@ def watch_clip(
             repeated += 1
             continue
         before = picture.image
-        image = picture.image if straighten is None else straighten(picture.image)
-        own = [_straight(reading(picture.source), straighten) for reading in given]
+        image = picture.image if undistort is None else undistort(picture.image)
+        own = [_straight(reading(picture.source), undistort) for reading in given]
         drawn = [mask for mask in own if mask is not None]
         if region is not None:
             around = region(image, picture.source)
@@ -149,20 +149,20 @@ def watch_clip(
     )  # fmt: skip
 
 
-def with_masks(watched: Watched, given: Own, straighten: Straighten | None = None) -> Watched:
+def with_masks(watched: Watched, given: Own, undistort: Undistort | None = None) -> Watched:
     """The user's own masks in place of the estimator's, where there are any; the files are written anew."""
     for path, source in zip(watched.masks, watched.sources, strict=True):
-        mask = _straight(given(source), straighten)
+        mask = _straight(given(source), undistort)
         if mask is not None:
             with plain_errors(path.parent):
                 save_picture(path, mask, compress_level=1)
     return watched
 
 
-def _straight(mask: UInt8[np.ndarray, "h w"] | None, straighten: Straighten | None) -> UInt8[np.ndarray, "h w"] | None:
-    if mask is None or straighten is None:
+def _straight(mask: UInt8[np.ndarray, "h w"] | None, undistort: Undistort | None) -> UInt8[np.ndarray, "h w"] | None:
+    if mask is None or undistort is None:
         return mask
-    return np.ascontiguousarray(straighten(np.repeat(mask[..., None], 3, 2))[..., 0])
+    return np.ascontiguousarray(undistort(np.repeat(mask[..., None], 3, 2))[..., 0])
 
 
 def save_picture(path: Path, pixels: UInt8[np.ndarray, "h w *c"], **options: int) -> None:
@@ -189,5 +189,5 @@ def clean_mask(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
 
 
 def spread_out(count: int, most: int) -> Sequence[int]:
-    """At most so many of 0..count-1, evenly."""
+    """At most this many of 0..count-1, evenly."""
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()}) if count else []

@@ -79,7 +79,7 @@ def fit(
         free_focal: the focal length of the one camera is a guess and is fitted too.
         config: weights.
         points_in_space: landmarks triangulated from several cameras, world, metres; NaN where unknown.
-        watch: told the share that is done.
+        watch: called with the fraction that is done.
 
     Raises:
         TwofoldError: nobody was found in any frame.

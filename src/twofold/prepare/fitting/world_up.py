@@ -12,7 +12,7 @@ from twofold.geometry.upright import turn_world
 from twofold.prepare.fitting.initialization import shortest_turns
 
 _CLOSE_TO_AXIS = 20.0
-"""A body that on average is upright along an axis of a calibrated world, to so many degrees: that axis is up."""
+"""Degrees: along an axis of a calibrated world closer to an average body than this, the world's up points."""
 
 
 def up_direction(poses: Float[Tensor, "t 24 3"], calibrated: bool) -> Float[Tensor, "3"]:

@@ -211,7 +211,7 @@ def warnings_about(
         )
     if moved is not None and moved > MOVING * width and not several:
         words.append(
-            f"The background moves by up to {moved:.0f} pixels: the camera does not stand still. Everything is told "
+            f"The background moves by up to {moved:.0f} pixels: the camera does not stand still. Everything is given "
             "relative to it, so the person seems to sway; put the camera on something firm."
         )
     if several:

@@ -239,7 +239,7 @@ def _least_difference(
     radius: float,
     enough: float = 0.1,
 ) -> Float[np.ndarray, "h w"]:
-    """The mean difference of the channels to the best fitting expected colour within so many pixels.
+    """The mean difference of the channels to the best fitting expected colour within that many pixels.
 
     It is exact where it is above `enough`; pixels that are alike so far are not looked at again. 0 outside `where`.
     """

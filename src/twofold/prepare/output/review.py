@@ -66,7 +66,7 @@ def compare_with_pictures(
         size: of the person in the images, pixels.
         held_objects: "remove" takes balls and the like out of the masks and marks what they hide.
         alone: no other camera saw the person.
-        show: told the share that is done.
+        show: called with the fraction that is done.
     """
     posed = pose_motion(body, motion)
     shown = project(camera, place_points(posed, body_points(body), motion))[0].numpy()

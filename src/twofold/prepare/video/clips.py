@@ -34,7 +34,7 @@ _SAME_RATE = 1.01
 """Rates that differ by less are the same: time stamps are rounded."""
 
 _LENS_MATTERS = 0.5
-"""Images are straightened where the lens moves a point by more pixels than this."""
+"""Images are undistorted where the lens moves a point by more pixels than this."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class PrepareConfig:
         intrinsics: fx, fy, cx, cy in pixels of the clip itself; None to find the focal length.
         calibration: file or folder with the cameras of several clips.
         train_camera: which clip trains where there are several, by its name; None for the first.
-        held_out: of so many frames one is kept for testing.
+        held_out: every Nth frame is held out for testing.
         held_objects: whether balls and the like are taken out of the masks.
         credit: whom to name when showing the images.
         masks: the user's own, instead of the estimator's.

@@ -93,5 +93,5 @@ def to_8_bits(values: Shaped[np.ndarray, "*s"], white: float) -> UInt8[np.ndarra
 
 
 def spread_evenly(files: Sequence[Path], most: int) -> Iterable[Path]:
-    """At most so many files, evenly spread."""
+    """At most this many files, evenly spread."""
     return [files[int(i)] for i in np.unique(np.linspace(0, len(files) - 1, min(len(files), most)).round())]

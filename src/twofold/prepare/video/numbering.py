@@ -14,7 +14,7 @@ from twofold.prepare.video.frames import ClipInfo
 _SLOWEST = 5
 """Exports of every second to every fifth image are thought of."""
 _CERTAIN = 3.0
-"""A reading is true that is better than the next by so many standard errors."""
+"""A reading is true that is better than the next by this many standard errors."""
 _ENOUGH = 5
 """Images on which two readings can be compared."""
 
