@@ -4,13 +4,17 @@ from torch.nn import functional as F
 
 from twofold.errors import TwofoldError
 from twofold.metrics.perceptual import (
+    ALEX_FILE,
+    ALEX_LINEAR_FILE,
+    FILES,
     LINEAR_FILE,
     LPIPS,
     VGG_FILE,
     load_lpips,
-    weights_folder,
+    lpips_cell,
     weights_hint,
 )
+from twofold.metrics.published_weights import find_weights, read_weights
 
 NUMBERS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 """Convolutions in torchvision's list of VGG16's layers."""
@@ -72,7 +76,7 @@ def literal_lpips(first, second, vgg, linear, kept=None):
 
 
 def test_distance_is_the_layer_by_layer_reference(published, folder):
-    model = load_lpips(folder)
+    model = load_lpips(folder, unverified=True)
     first, second = torch.rand(2, 3, 24, 20), torch.rand(2, 3, 24, 20)
     found = model(first, second)
     for i in range(2):
@@ -81,7 +85,7 @@ def test_distance_is_the_layer_by_layer_reference(published, folder):
 
 def test_dropout_leaves_out_half_of_the_squared_differences_and_doubles_the_rest(published, folder):
     first, second = torch.rand(2, 3, 24, 24), torch.rand(2, 3, 24, 24)
-    found = load_lpips(folder)(first, second, 0.5, torch.Generator().manual_seed(5))
+    found = load_lpips(folder, unverified=True)(first, second, 0.5, torch.Generator().manual_seed(5))
     source = torch.Generator().manual_seed(5)
     shapes = [(2, n, 24 // 2**i, 24 // 2**i) for i, n in enumerate((64, 128, 256, 512, 512))]
     kept = [torch.rand(shape, generator=source) >= 0.5 for shape in shapes]
@@ -138,14 +142,6 @@ def test_absent_files_give_none_and_a_hint_that_names_them(tmp_path):
     assert "\n" not in hint
 
 
-def test_folder_follows_the_environment(monkeypatch, tmp_path):
-    monkeypatch.setenv("TWOFOLD_WEIGHTS", str(tmp_path / "mine"))
-    assert weights_folder() == tmp_path / "mine"
-    monkeypatch.delenv("TWOFOLD_WEIGHTS")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert weights_folder() == tmp_path / "twofold" / "weights"
-
-
 class Trap:
     """What a file of code looks like: unpickling it would raise the alarm."""
 
@@ -171,11 +167,84 @@ def test_wrong_files_get_one_sentence_and_run_no_code(content, words, published,
         torch.save(content, tmp_path / VGG_FILE)  # noqa: TID251
     torch.save(published[1], tmp_path / LINEAR_FILE)  # noqa: TID251
     with pytest.raises(TwofoldError, match=words):
-        load_lpips(tmp_path)
+        load_lpips(tmp_path, unverified=True)
 
 
 def test_weights_given_as_the_other_file_are_refused(published, folder, tmp_path):
     (tmp_path / VGG_FILE).symlink_to(folder / VGG_FILE)
     (tmp_path / LINEAR_FILE).symlink_to(folder / VGG_FILE)
     with pytest.raises(TwofoldError, match=r"lin0.model.1.weight is missing"):
-        load_lpips(tmp_path)
+        load_lpips(tmp_path, unverified=True)
+
+
+def test_other_weights_are_refused_unless_they_are_meant_and_then_marked(folder, monkeypatch):
+    monkeypatch.delenv("TWOFOLD_UNVERIFIED_WEIGHTS", raising=False)
+    with pytest.raises(TwofoldError, match=r"is not the published torchvision's VGG16.*--unverified-weights"):
+        load_lpips(folder)
+    assert not load_lpips(folder, unverified=True).verified
+    monkeypatch.setenv("TWOFOLD_UNVERIFIED_WEIGHTS", "1")
+    assert not load_lpips(folder).verified
+
+
+def test_feature_layers_of_an_installed_package_are_the_published_ones(tmp_path, monkeypatch):
+    """Those that come with torchmetrics, in the real format and with the real hash."""
+    monkeypatch.setenv("TWOFOLD_WEIGHTS", str(tmp_path))
+    for network, file in FILES.items():
+        found = find_weights(file[1])
+        assert found.verified
+        width = 64
+        weights = read_weights(found, {"lin0.model.1.weight": (width,)})["lin0.model.1.weight"]
+        assert (weights >= 0).all(), network
+        assert weights.max() > 0
+
+
+@pytest.fixture(scope="module")
+def alex(tmp_path_factory):
+    """AlexNet's two files with random numbers."""
+    generator = torch.Generator().manual_seed(3)
+    folder, network, linear, inputs = tmp_path_factory.mktemp("alex"), {}, {}, 3
+    for i, (number, outputs, kernel) in enumerate(((0, 64, 11), (3, 192, 5), (6, 384, 3), (8, 256, 3), (10, 256, 3))):
+        spread = (2 / (kernel**2 * inputs)) ** 0.5
+        network[f"features.{number}.weight"] = spread * torch.randn(
+            outputs, inputs, kernel, kernel, generator=generator
+        )
+        network[f"features.{number}.bias"] = 0.1 * torch.randn(outputs, generator=generator)
+        linear[f"lin{i}.model.1.weight"] = torch.rand(1, outputs, 1, 1, generator=generator)
+        inputs = outputs
+    torch.save(network, folder / ALEX_FILE)  # noqa: TID251
+    torch.save(linear, folder / ALEX_LINEAR_FILE)  # noqa: TID251
+    return folder, network, linear
+
+
+def test_alexnet_is_the_layer_by_layer_reference(alex):
+    folder, network, linear = alex
+    first, second = torch.rand(2, 3, 40, 35), torch.rand(2, 3, 40, 35)
+    found = load_lpips(folder, "alex", unverified=True)(first, second)
+
+    def features(image):
+        shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+        x, taps = ((2 * image - 1 - shift[:, None, None]) / scale[:, None, None])[None], []
+        for number in range(12):
+            if number in (0, 3, 6, 8, 10):
+                stride, padding = (4, 2) if number == 0 else (1, 2 if number == 3 else 1)
+                weight, bias = network[f"features.{number}.weight"], network[f"features.{number}.bias"]
+                x = F.conv2d(x, weight, bias, stride=stride, padding=padding)
+            elif number in (2, 5):
+                x = F.max_pool2d(x, kernel_size=3, stride=2)
+            else:
+                x = x.clamp_min(0)
+                taps.append(x[0] / (x[0].square().sum(0).sqrt() + 1e-10))
+        return taps
+
+    for i in range(2):
+        total = sum(
+            F.conv2d((a - b)[None].square(), linear[f"lin{k}.model.1.weight"]).mean().item()
+            for k, (a, b) in enumerate(zip(features(first[i]), features(second[i]), strict=True))
+        )
+        assert found[i].item() == pytest.approx(total, rel=1e-4)
+    with pytest.raises(ValueError, match="31 x 31"):
+        load_lpips(folder, "alex", unverified=True)(first[:, :, :30], second[:, :, :30])
+
+
+def test_a_cell_without_weights_says_what_to_put_where(tmp_path):
+    assert lpips_cell(tmp_path, "alex") == f"n/a (put {ALEX_FILE} and {ALEX_LINEAR_FILE} in {tmp_path})"
