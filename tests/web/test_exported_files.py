@@ -56,7 +56,7 @@ def test_browser_skins_and_morphs_like_twofold(kind: str, tmp_path: Path) -> Non
     for frame, shown in zip(frames, found["frames"], strict=True):
         own = pose_character(character, clip.poses[frame], clip.translations[frame], clip.weights[frame])
         assert np.abs(np.array(shown["points"]) - own[character.atlas.vertex][::every]).max() < 1e-4
-        save(shown["picture"], tmp_path / f"{kind}-{frame}.png")
+        save(shown["image"], tmp_path / f"{kind}-{frame}.png")
         with Image.open(tmp_path / f"{kind}-{frame}.png") as picture:
             assert (np.asarray(picture.convert("RGB")) < 250).mean() > 0.01, "nothing is to be seen"
     if kind == "vrm":
