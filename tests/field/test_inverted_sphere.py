@@ -111,3 +111,9 @@ def test_parameter_counts_are_the_authors():
     field = InvertedSphereFieldConfig().build()
     assert sum(p.numel() for p in field.geometry.parameters()) == 534_957
     assert sum(p.numel() for p in field.color.parameters()) == 40_835
+
+
+@pytest.mark.parametrize("setting", [{"width": 84}, {"skip_layer": 8}, {"code_size": 0}])
+def test_impossible_sizes_are_refused(setting):
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        InvertedSphereFieldConfig(**setting)

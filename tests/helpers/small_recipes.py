@@ -53,7 +53,9 @@ def shrunk_sampler(sampler: ErrorBoundedSampler | ShellSampler) -> ErrorBoundedS
 
 def shrunk_vid2avatar(recipe: Recipe, method: Vid2AvatarConfig) -> Recipe:
     field = replace(method.field, width=56, sdf_depth=4, color_depth=2, skip_layer=2, hidden_dtype="float32")
-    scene = method.scene and replace(method.scene, width=120, depth=3, skip_layer=2, color_width=16, code_size=4)
+    scene = method.scene and replace(
+        method.scene, width=120, depth=3, skip_layer=2, color_width=16, code_size=4, hidden_dtype="float32"
+    )
     method = replace(
         method,
         field=field,

@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from twofold.config import require, require_within
 from twofold.field.encoding import encoding_size, fourier_encoding
-from twofold.field.networks import Network, NetworkConfig
+from twofold.field.networks import Network, NetworkConfig, Precision
 from twofold.field.output import RadianceOutput
 
 RADIUS = 3.0
@@ -109,10 +110,26 @@ class InvertedSphereFieldConfig:
     """Sizes of the background field; the defaults are those of Vid2Avatar."""
 
     code_size: int = 32
+    """Numbers that stand for a frame."""
     width: int = 256
+    """Units of the hidden layers of the first network."""
     depth: int = 8
+    """Of these layers."""
     skip_layer: int = 4
+    """The one that sees the encoded point again."""
     color_width: int = 128
+    """Units of the colour's hidden layer."""
+    hidden_dtype: Precision = "float32"
+    """Of the layers between first and last, see `Precision`."""
+
+    def __post_init__(self) -> None:
+        """Refuses sizes that no network has."""
+        require_within(
+            self, code_size=(1, 4096), width=(1, 4096), depth=(2, 64), skip_layer=(1, self.depth - 1),
+            color_width=(1, 4096),
+        )  # fmt: skip
+        columns = encoding_size(POINT_OCTAVES, 4)
+        require(columns < self.width, f"width={self.width} should be above {columns}, the columns that skip_layer adds")
 
     def build(self, generator: torch.Generator | None = None) -> "InvertedSphereField":
         """A new field, its initial weights drawn from `generator`."""
@@ -139,6 +156,7 @@ class InvertedSphereField(nn.Module):
             skip_columns=encoded,
             weight_norm=False,
             start="torch",
+            hidden_dtype=config.hidden_dtype,
         )
         color = NetworkConfig(
             inputs=encoding_size(VIEW_OCTAVES) + config.width,

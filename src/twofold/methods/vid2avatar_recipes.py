@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from twofold.field.implicit_geometry import ImplicitFieldConfig
+from twofold.field.inverted_sphere import InvertedSphereFieldConfig
 from twofold.field.prefit import PrefitConfig
 from twofold.losses import LossConfig
 from twofold.methods.pose_schedule import PoseConfig
@@ -67,7 +68,9 @@ def vid2avatar_fast() -> Recipe:
     recipe = _faster(vid2avatar())
     # The weights of separation move on four epochs in one, so that they end where the long training does.
     separation = SeparationConfig(pace=4.0, surface_every=5)
-    return replace(recipe, name="vid2avatar_fast", method=replace(recipe.method, center="world", separation=separation))
+    scene = InvertedSphereFieldConfig(hidden_dtype="auto")
+    method = replace(recipe.method, center="world", scene=scene, separation=separation)
+    return replace(recipe, name="vid2avatar_fast", method=method, training=replace(recipe.training, steps=2000))
 
 
 def vid2avatar_mask_fast() -> Recipe:
