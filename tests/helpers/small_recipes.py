@@ -40,7 +40,12 @@ def shrunk(recipe: Recipe) -> Recipe:
 
 def shrunk_boxed(recipe: Recipe) -> Recipe:
     """PM-Avatar, DANBO and NPC with few samples; their networks are the whole ones."""
-    method = replace(recipe.method, boxed=replace(recipe.method.boxed, coarse=12, fine=6, hidden_dtype="float32"))
+    few = {"coarse": 12, "fine": 6, "hidden_dtype": "float32"}
+    method = replace(recipe.method, boxed=replace(recipe.method.boxed, **few))
+    if hasattr(method, "first"):
+        method = replace(
+            method, first=replace(method.first, **few), points=8, point_voxel=0.03, first_steps=3, first_rays=64
+        )
     pixels = replace(recipe.training.pixels, rays=64)
     return replace(recipe, method=method, training=replace(recipe.training, pixels=pixels))
 

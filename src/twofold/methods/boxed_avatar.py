@@ -5,8 +5,8 @@ there are those "in the root frame" of the authors' programs, and turning camera
 """
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
-from typing import Generic, Literal, TypeVar
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from twofold.body.skeleton import joint_transforms, pose_body, shape_body
-from twofold.config import require, require_within
+from twofold.config import require
 from twofold.field.bone_boxes import BoneFrames, BoxSizes, bone_frames, box_coordinates, initial_half_sizes
 from twofold.field.conditioned_radiance import CODE_SIZE
 from twofold.field.graph import pose_features
@@ -26,6 +26,7 @@ from twofold.kernels.kdtree import search_tree
 from twofold.kernels.mlp import MLP
 from twofold.losses import reconstruction
 from twofold.methods.base import EVALUATION, Avatar, Batch, Mode, PosedAvatar, Rendering
+from twofold.methods.boxed_config import BoxedPose, BoxedSettings, Radiance, Shared
 from twofold.methods.subject import Subject
 from twofold.sampling.box_bounds import BOX_SCALE, clip_to_bone_boxes, clip_to_cylinder
 from twofold.sampling.error_bounded import uniform_depths
@@ -34,77 +35,12 @@ from twofold.volume.nerf_compositing import alpha_of_density, alpha_weights, ope
 from twofold.volume.rendering import composite
 from twofold.volume.samples import Samples
 
-Shared = TypeVar("Shared")
-
 RAYS_AT_ONCE, POINTS_AT_ONCE = 2048, 16_384
 """Rays and samples that are computed together where no gradient is wanted."""
 LEVEL_SCALE = 0.03
 """What `density_level` is where there is no density at all, metres."""
 CODE_SPREAD = 0.1
 """Standard deviation of the initial frame codes."""
-
-
-@dataclass(frozen=True)
-class BoxedSettings:
-    """What the three methods have in common; the defaults are PM-Avatar's and DANBO's."""
-
-    coarse: int = 48
-    """Evenly spaced samples between the ends of the boxes that a ray meets."""
-    fine: int = 24
-    """More samples, where the first found density."""
-    max_distance: float | None = None
-    """Points further than this from the posed body's vertices are empty, metres; none: whatever the boxes hold."""
-    hidden_dtype: Literal["float32", "bfloat16", "auto"] = "float32"
-    """Type of the hidden layers of the ReLU networks; "auto": bfloat16 where the processor multiplies it fast. Layers
-    of sines stay in float32: their frequencies would magnify the rounding."""
-    level_density: float = 5.0
-    """Density of the surface, per metre."""
-    background: Literal["noise", "capture"] = "noise"
-    """What training images are composited on: a random colour for each ray, as released, or the capture's own."""
-
-    def __post_init__(self) -> None:
-        """Refuses what nothing can be rendered with."""
-        require_within(self, coarse=(3, 1024), fine=(2, 1024), max_distance=(0.01, 10), level_density=(1e-3, 1e4))
-
-
-@dataclass(frozen=True)
-class BoxedPose(Generic[Shared]):
-    """What these methods derive from a pose, in the root's space.
-
-    Attributes:
-        to_root: from the world.
-        transforms: from the T-pose, one a joint.
-        to_frame: from the root's space to the bone-aligned frame of each joint.
-        half_sizes: of the boxes, metres.
-        joints: posed, metres.
-        code: of the frame, or the mean of all.
-        tree: of the body's posed vertices, where only points near it are computed.
-        shared: what the method's networks make of the pose, once for all samples.
-    """
-
-    to_root: Float[Tensor, "4 4"]
-    transforms: Float[Tensor, "24 4 4"]
-    to_frame: Float[Tensor, "24 4 4"]
-    half_sizes: Float[Tensor, "24 3"]
-    joints: Float[Tensor, "24 3"]
-    code: Float[Tensor, "c"]
-    tree: KDTree | None
-    shared: Shared
-
-
-@dataclass(frozen=True)
-class Radiance:
-    """Density and colour at points, and what the method's losses need of them.
-
-    Attributes:
-        density: per metre.
-        color: 0..1.
-        extra: one number of each point for the method's own losses; zeros where it has none.
-    """
-
-    density: Float[Tensor, "S"]
-    color: Float[Tensor, "S 3"]
-    extra: Float[Tensor, "S"]
 
 
 def root_pose(
@@ -229,6 +165,7 @@ class BoxedAvatar(Avatar[BoxedPose[Shared]]):
             joints=joints,
             code=self.codes.mean(0) if row is None else self.codes[row],
             tree=self._tree(body.vertices, to_root),
+            training=mode.training,
             shared=self.shared(features, transforms),
         )
         return PosedAvatar(body, own)

@@ -11,7 +11,8 @@ from twofold.config import require_within
 from twofold.field.bone_boxes import RIGID_PARTS
 from twofold.losses import box_assignment, box_volumes
 from twofold.methods.base import Batch, MethodConfig, Mode, ParameterGroup, PosedAvatar, Rendering
-from twofold.methods.boxed_avatar import BoxedAvatar, BoxedPose, BoxedSettings, Radiance
+from twofold.methods.boxed_avatar import BoxedAvatar
+from twofold.methods.boxed_config import BoxedPose, BoxedSettings, Radiance
 from twofold.methods.local_radiance import POSE_OCTAVES, LocalRadiance, inside_rigid
 from twofold.methods.subject import Subject
 from twofold.recipe import PixelConfig, Recipe, TrainingConfig

@@ -8,7 +8,7 @@ from twofold.field.bone_boxes import RIGID_PARTS, inside_boxes
 from twofold.field.conditioned_radiance import ConditionedRadiance
 from twofold.field.encoding import encoding_size, fourier_encoding
 from twofold.field.local_volumes import VOLUME_COLUMNS, LocalVolumes
-from twofold.methods.boxed_avatar import Radiance
+from twofold.methods.boxed_config import Radiance
 
 FEATURE_OCTAVES, VIEW_OCTAVES, POSE_OCTAVES = 6, 4, 5
 

@@ -16,7 +16,8 @@ from twofold.field.spherical_harmonics import spherical_harmonics
 from twofold.geometry.cameras import Rays
 from twofold.losses import box_volumes
 from twofold.methods.base import Batch, MethodConfig, Mode, ParameterGroup, PosedAvatar, Rendering
-from twofold.methods.boxed_avatar import BoxedAvatar, BoxedPose, BoxedSettings, Radiance
+from twofold.methods.boxed_avatar import BoxedAvatar
+from twofold.methods.boxed_config import BoxedPose, BoxedSettings, Radiance
 from twofold.methods.subject import Subject
 from twofold.recipe import PixelConfig, Recipe, TrainingConfig
 
