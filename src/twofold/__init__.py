@@ -35,7 +35,18 @@ _EXPORTS = {
 }
 """Public names and the modules that hold them."""
 
-__all__ = ["__version__", *_EXPORTS]
+__all__ = [  # pyright: ignore[reportUnsupportedDunderAll]
+    "Avatar",
+    "Camera",
+    "Capture",
+    "__version__",
+    "evaluate",
+    "load",
+    "mesh",
+    "read_capture",
+    "render",
+    "train",
+]
 
 
 def __getattr__(name: str) -> object:

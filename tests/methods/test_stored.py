@@ -9,6 +9,7 @@ import pytest
 from twofold.methods.factorized_recipes import quick, released
 from twofold.methods.stored import ABSENT, KINDS, completed
 from twofold.methods.table import DROPPED, RENAMES, recipe_from_dict, recipe_to_dict
+from twofold.methods.table import _renamed as renamed
 
 STORED = Path(__file__).with_name("stored")
 
@@ -65,3 +66,9 @@ def test_what_is_no_recipe_is_left_to_its_reader(odd):
     assert {key: found[key] for key in odd if not isinstance(odd[key], dict)} == {
         key: value for key, value in odd.items() if not isinstance(value, dict)
     }
+
+
+def test_renames_of_an_odd_recipe_do_not_fail():
+    odd = {"method": {"rates": 5}, "training": {"rate_low": 1e-3}}
+    assert renamed(odd)["method"]["rates"] == 5
+    assert renamed({"training": {"rate_low": 1e-3}}) == {"training": {"rate_low": 1e-3}}

@@ -83,28 +83,27 @@ def _renamed(data: dict[str, Any]) -> dict[str, Any]:
     """Stored settings under their present names."""
     new = json.loads(json.dumps(data))
     for old in DROPPED:
-        *parents, leaf = old.split(".")
-        (_inside(new, parents) or {}).pop(leaf, None)
+        path = [str(name) for name in old.split(".")]
+        (_inside(new, path[:-1]) or {}).pop(path[-1], None)
     for old, present in RENAMES.items():
-        *parents, leaf = old.split(".")
-        place = _inside(new, parents)
-        if place is not None and leaf in place:
-            value = place.pop(leaf)
-            *parents, leaf = present.split(".")
-            target = new
-            for parent in parents:
-                target = target.setdefault(parent, {})
-            target.setdefault(leaf, value)
+        path, target = [str(name) for name in old.split(".")], [str(name) for name in present.split(".")]
+        place = _inside(new, path[:-1])
+        above = _inside(new, target[:-2])
+        if place is None or path[-1] not in place or above is None:
+            continue
+        value = place.pop(path[-1])
+        into = above.setdefault(target[-2], {})
+        if isinstance(into, dict):
+            into.setdefault(target[-1], value)
     return new
 
 
-def _inside(data: dict[str, Any], path: list[str]) -> dict[str, Any] | None:
+def _inside(data: dict[str, Any], path: Sequence[str]) -> dict[str, Any] | None:
     """The object at a path, or None where there is none."""
+    found: Any = data
     for name in path:
-        data = data.get(name)  # type: ignore[assignment]
-        if not isinstance(data, dict):
-            return None
-    return data
+        found = found.get(name) if isinstance(found, dict) else None
+    return found if isinstance(found, dict) else None
 
 
 def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
