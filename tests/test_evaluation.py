@@ -14,6 +14,7 @@ from twofold.capture.types import Capture, Frame
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
+from twofold.metrics.protocols import Networks
 from twofold.outputs.views import Picture
 from twofold.training.run import load
 
@@ -118,3 +119,50 @@ def test_by_default_a_long_split_is_sampled_evenly_and_the_protocol_says_so(capt
     seen.clear()
     evaluate.evaluate(refined_avatar(()), long, tmp_path, most=None)
     assert len(seen) == 301
+
+
+def exact(avatar, capture, frame, refined):
+    image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
+    return Picture(image, mask, depth=mask, normal=image, base=image, base_normal=image)
+
+
+def test_protocols_of_papers_and_a_video_are_measured_where_asked_for(capture, monkeypatch, tmp_path):
+    monkeypatch.setattr(evaluate, "draw_frame", exact)
+    told = []
+    metrics = evaluate.evaluate(
+        refined_avatar(()), capture, tmp_path, show=lambda share, what: told.append(share), networks=Networks({})
+    )
+    table = metrics["novel_pose_protocols"]
+    assert table["humannerf_psnr"] == table["instantavatar_psnr"] == 100
+    assert table["protocol"]["instantavatar_psnr"].startswith("InstantAvatar: whole image, background (1.0, 1.0, 1.0)")
+    assert table["kid_x1000"].startswith("n/a (put ")
+    assert metrics["consistency"]["flow_error_px"] == 0
+    assert metrics["consistency"]["protocol"]["frames"] == "2 successive frames of the camera cam, 0.1 s apart"
+    assert told[-1] == 1
+    assert not {"novel_pose_protocols", "consistency"} & evaluate.measure(refined_avatar(()), capture).keys()
+
+
+def test_ignored_pixels_spoil_no_protocol(capture, monkeypatch):
+    def spoilt(avatar, capture, frame, refined):
+        whole = exact(avatar, capture, frame, refined)
+        ignored = frame.ignored()
+        color, opacity = torch.where(ignored[..., None], 0.3, whole.color), torch.where(ignored, 0.0, whole.opacity)
+        return replace(whole, color=color, opacity=opacity)
+
+    monkeypatch.setattr(evaluate, "draw_frame", spoilt)
+    table = evaluate.measure(refined_avatar(()), capture, networks=Networks({}))["novel_pose_protocols"]
+    assert table["instantavatar_psnr"] == table["npc_psnr"] == 100
+
+
+def test_a_video_is_the_longest_run_of_one_camera_without_gaps(capture):
+    frame = capture.splits["train"][0]
+    moved = replace(frame.camera, world_to_camera=torch.eye(4) + 0.1)
+    frames = [replace(frame, time=t, camera_name="a") for t in (0, 2, 4, 9, 11, 13, 15)]
+    frames += [replace(frame, time=t, camera_name="b", camera=moved if t > 4 else frame.camera) for t in range(8)]
+    splits = {**capture.splits, "novel_pose": tuple(frames[::-1])}
+    chosen = evaluate.steady_video(replace(capture, splits=splits))
+    assert {f.camera_name for f in chosen} == {"b"}
+    assert [f.time for f in chosen] == [0, 1, 2, 3, 4]
+    assert len(evaluate.steady_video(replace(capture, splits=splits), 3)) == 3
+    alone = {"train": (frame,), "novel_view": (), "novel_pose": (frame,)}
+    assert evaluate.steady_video(replace(capture, splits=alone)) == []

@@ -1,6 +1,7 @@
 """Evaluation: which frames are measured, how, and the file that says so."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from twofold.files import write_json
 from twofold.methods.base import Avatar, PosedAvatar
 from twofold.metrics import image as image_metrics
 from twofold.metrics import shape as shape_metrics
+from twofold.metrics import video as video_metrics
+from twofold.metrics.protocols import Networks, ProtocolMeans
 from twofold.outputs.mesh import posed_surface
 from twofold.outputs.shares import Shares
 from twofold.outputs.views import Picture, draw
@@ -21,6 +24,8 @@ NEAR = 0.5
 """Seconds over which the errors of an estimator's poses last."""
 _MESH = 4.0
 """Images that can be measured while one surface is; a first guess, until one has been."""
+VIDEO_LENGTH = 16
+"""Images of the video whose consistency is measured."""
 MAX_IMAGES = 30
 """Images a split that are measured unless more are asked for, evenly spread: a minute or two on two cores."""
 
@@ -159,9 +164,58 @@ def measure_refinement(
     return found | {"protocol": told}
 
 
+def add_picture(means: ProtocolMeans, capture: Capture, frame: Frame, picture: Picture) -> None:
+    """One rendering more for the table of protocols; pixels that are ignored take the true colours."""
+    truth, ignored, mask = frame.composited(torch.tensor(capture.background)), frame.ignored(), frame.mask()
+    color = torch.where(ignored[..., None], truth, picture.color)
+    opacity = torch.where(ignored, mask, picture.opacity)
+    means.add(color, opacity, mask, capture.background, lambda background: frame.composited(torch.tensor(background)))
+
+
+def steady_video(capture: Capture, most: int = VIDEO_LENGTH) -> list[Frame]:
+    """Successive frames of one camera that stands still: the longest such run of novel poses, else of another split."""
+    best: list[Frame] = []
+    for split in ("novel_pose", "novel_view", "train"):
+        frames = sorted(capture.splits.get(split, ()), key=lambda f: (f.camera_name, f.time))
+        for _, group in groupby(frames, key=lambda f: f.camera_name):
+            taken = list(group)
+            step = min((b.time - a.time for a, b in pairwise(taken) if b.time > a.time), default=0)
+            run = taken[:1]
+            for before, now in pairwise(taken):
+                still = torch.equal(before.camera.world_to_camera, now.camera.world_to_camera)
+                run = [*run, now] if now.time - before.time == step and still else [now]
+                if len(run) > max(len(best), 1):
+                    best = run
+        if best:
+            break
+    return best[:most]
+
+
+def measure_consistency(
+    avatar: Avatar, capture: Capture, most: int = VIDEO_LENGTH, watch: Callable[[], None] | None = None
+) -> dict[str, object]:
+    """Figures of the flow between successive frames of `steady_video`; empty where there is no such video."""
+    frames = steady_video(capture, most)
+
+    def rendered() -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+        for frame in frames:
+            picture = draw_frame(avatar, capture, frame, True)
+            if watch:
+                watch()
+            yield picture.color, frame.composited(torch.tensor(capture.background)), frame.mask()
+
+    figures: dict[str, object] = dict(video_metrics.frame_consistency(rendered()))
+    if not figures:
+        return {}
+    seconds = (frames[1].time - frames[0].time) / capture.fps
+    told = f"{len(frames)} successive frames of the camera {frames[0].camera_name}, {seconds:.3g} s apart"
+    return figures | {"protocol": {**video_metrics.PROTOCOLS, "frames": told}}
+
+
 def evaluate(
     avatar: Avatar, capture: Capture, folder: Path, most: int | None = MAX_IMAGES, meshes: int | None = 4,
     show: Callable[[float, str], None] | None = None, extra: dict[str, object] | None = None,
+    networks: Networks | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """`measure` with its metrics written to `metrics.json` in the run's folder.
 
@@ -173,18 +227,19 @@ def evaluate(
         meshes: at most this many ground-truth meshes.
         show: progress, with the part that is done and what is being measured.
         extra: further sections for the file.
+        networks: see `measure`.
 
     Raises:
         TwofoldError: an image or mesh is damaged, or the avatar's numbers are not finite.
     """
-    metrics = measure(avatar, capture, most, meshes, show) | (extra or {})
+    metrics = measure(avatar, capture, most, meshes, show, networks) | (extra or {})
     write_json(folder / "metrics.json", metrics)
     return metrics
 
 
 def measure(
     avatar: Avatar, capture: Capture, most: int | None = MAX_IMAGES, meshes: int | None = 4,
-    show: Callable[[float, str], None] | None = None,
+    show: Callable[[float, str], None] | None = None, networks: Networks | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """Metrics of everything that the capture knows the ground truth of.
 
@@ -194,6 +249,8 @@ def measure(
         most: at most this many images a split; None for all.
         meshes: at most this many ground-truth meshes.
         show: progress, with the part that is done and what is being measured.
+        networks: measures under the settings of several papers as well (`twofold.metrics.protocols`), and the
+            consistency of a video, with what networks there are; None leaves both out.
 
     Raises:
         TwofoldError: an image or mesh is damaged, or the avatar's numbers are not finite.
@@ -206,6 +263,7 @@ def measure(
     # Training images are drawn once more, in the poses as given; held-out ones in both.
     refined = pictures["train"] + 2 * min(pictures["novel_pose"], few) if _refines(avatar) else 0
     pieces = {**pictures, "pose refinement": refined, "geometry": len(_with_mesh(capture, meshes))}
+    pieces["consistency"] = len(steady_video(capture)) if networks else 0
     section = ""
     shares = Shares(pieces, {"geometry": _MESH}, lambda share: show(share, section) if show else None)
 
@@ -216,13 +274,25 @@ def measure(
 
     metrics: dict[str, object] = {}
     for split in ("novel_view", "novel_pose"):
-        part = measure_split(avatar, capture, split, most, True, lambda f, p, s=split: watch(s))
+        means = ProtocolMeans(networks) if networks else None
+
+        def seen(frame: Frame, picture: Picture, split: str = split, means: ProtocolMeans | None = means) -> None:
+            if means:
+                add_picture(means, capture, frame, picture)
+            watch(split)
+
+        part = measure_split(avatar, capture, split, most, True, seen)
         if part:
             metrics[split] = part
+        if means and part:
+            metrics[f"{split}_protocols"] = means.figures() | {"protocol": means.protocols()}
     metrics["train"] = trained = measure_split(avatar, capture, "train", few, True, lambda f, p: watch("train"))
     geometry = measure_geometry(avatar, capture, meshes, watch=lambda: watch("geometry"))
     if geometry:
         metrics["geometry"] = geometry
+    consistency = measure_consistency(avatar, capture, watch=lambda: watch("consistency")) if networks else {}
+    if consistency:
+        metrics["consistency"] = consistency
     if _refines(avatar):
         metrics["pose_refinement"] = measure_refinement(
             avatar, capture, few, trained, lambda f, p: watch("pose refinement")

@@ -20,6 +20,7 @@ from twofold.cli.captures import check, import_capture, prepare, studio
 from twofold.cli.console import ALONE, bar, console, say, within
 from twofold.cli.exports import export
 from twofold.cli.motions import NO_MOTION, MotionView, motion, render_motion
+from twofold.cli.protocol_table import networks_asked_for, print_protocols
 from twofold.cli.streams import streams_that_never_fail
 from twofold.errors import TwofoldError
 
@@ -184,6 +185,9 @@ def evaluate(
     capture: Path | None = None,
     max_images: int | Literal["all"] = 30,
     max_meshes: int | Literal["all"] = 4,
+    protocol: Literal["default", "all"] = "default",
+    weights: Path | None = None,
+    unverified_weights: bool = False,
     device: str = "auto",
 ) -> None:
     """Measure an avatar against its capture's held-out images and ground truth; writes RUN/metrics.json.
@@ -193,6 +197,10 @@ def evaluate(
         capture: Capture folder, if it has moved since training.
         max_images: Images measured of each split, evenly spread; all for all.
         max_meshes: Ground-truth meshes measured, evenly spread; all for all.
+        protocol: default, or all: also under the settings of several papers, with LPIPS, KID and FID where their
+            weights are there, and the consistency of a video.
+        weights: Folder with the networks' published weights; by default the usual caches.
+        unverified_weights: Accept other weights than the published ones and mark what is measured with them.
         device: auto, cpu, cuda or cuda:N.
     """
     from twofold.capture.folder import read_capture
@@ -202,15 +210,18 @@ def evaluate(
     images, meshes = (None if given == "all" else given for given in (max_images, max_meshes))
     within(max_images=(images, 1, None), max_meshes=(meshes, 0, None))
     require_run(run)
+    networks = networks_asked_for(protocol, weights, unverified_weights)
     avatar, _ = load(run, choose_device(device))
     source = find_capture(run, capture)
     require_capture(source)
     read = read_capture(source)
     require_same(run, read, motion=True)
     with bar("Measuring") as show:
-        metrics = measure(avatar, read, run, images, meshes, show)
+        metrics = measure(avatar, read, run, images, meshes, show, networks=networks)
     for section, values in metrics.items():
-        if isinstance(values, dict):
+        if section.endswith("_protocols"):
+            print_protocols(section, values)
+        elif isinstance(values, dict):
             numbers = {k: v for k, v in values.items() if isinstance(v, float)}
             line = f"{section}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items())
             console().print(line, soft_wrap=True)
