@@ -112,12 +112,18 @@ def _sha256(path: Path) -> str:
 
 
 def missing_cell(files: tuple[WeightFile, ...], folder: Path | None = None) -> str:
-    """What stands in a table in place of a number that needs the files.
+    """What stands in a table in place of a number that needs the files: which of them are absent.
 
     >>> missing_cell((WeightFile("a.pth", "00", "A", "https://example.org/a.pth"),), Path("weights"))
     'n/a (put a.pth in weights)'
     """
-    return f"n/a (put {' and '.join(file.name for file in files)} in {folder or weights_folder()})"
+    place = folder or weights_folder()
+    absent = [
+        file.name
+        for file in files
+        if not any(path.is_file() for path in (place / file.name, *(() if folder else _in_caches(file))))
+    ]
+    return f"n/a (put {' and '.join(absent or [file.name for file in files])} in {place})"
 
 
 def missing_sentence(name: str, files: tuple[WeightFile, ...], folder: Path | None = None) -> str:
