@@ -35,11 +35,11 @@ def seconds(avatar: Avatar, capture: Capture, size: int, repeats: int) -> dict[s
     background = torch.tensor(capture.background)
     device = next(avatar.parameters()).device
 
-    def picture() -> None:
+    def image() -> None:
         with torch.no_grad():
             draw(avatar, avatar.pose(frame.pose, frame.translation), camera.to(device), background)
 
-    return timed(picture, repeats)
+    return timed(image, repeats)
 
 
 def take_shape(avatar: FactorizedAvatar, capture: Capture, steps: int = 300, points: int = 2048) -> float:

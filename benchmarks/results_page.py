@@ -70,7 +70,7 @@ def results_page(results: dict[str, Any]) -> str:
 def readme_table(results: dict[str, Any]) -> str:
     """The five rows of the README, Markdown."""
     one, two = results["step-cpu-1threads"], results["step-cpu-2threads"]
-    picture, picture_one = results["rendering-cpu-2threads"], results["rendering-cpu-1threads"]
+    image, picture_one = results["rendering-cpu-2threads"], results["rendering-cpu-1threads"]
     rows = {row["subject"]: row["result"] for row in results["captures"]["rows"]}
     return _table(
         ("What", "Result"),
@@ -88,7 +88,7 @@ def readme_table(results: dict[str, Any]) -> str:
             ),
             (
                 "Image of 512 x 512",
-                f"recipe `quick` {_s(picture['quick']['512'])}, the paper's networks {_s(picture['fast']['512'])}; "
+                f"recipe `quick` {_s(image['quick']['512'])}, the paper's networks {_s(image['fast']['512'])}; "
                 f"on one core {_s(picture_one['quick']['512'])} and {_s(picture_one['fast']['512'])}",
             ),
         ],

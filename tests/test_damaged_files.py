@@ -272,10 +272,10 @@ def test_damaged_images_and_masks_are_said_to_be_so(ending: str, clip: Path, tmp
     def read() -> None:
         assert len(list(Frames(folder))) == 12
         read_mask(mask)
-        if mask.read_bytes() != whole or (folder / f"3.{ending}").read_bytes() != picture:
+        if mask.read_bytes() != whole or (folder / f"3.{ending}").read_bytes() != image:
             raise TwofoldError("A bitmap may be read all the same.")
 
-    whole, picture = mask.read_bytes(), (folder / f"3.{ending}").read_bytes()
+    whole, image = mask.read_bytes(), (folder / f"3.{ending}").read_bytes()
     survives(mask, damaged_bytes, read)
     survives(folder / f"3.{ending}", damaged_bytes, read)
 

@@ -15,7 +15,7 @@ from twofold.deform.pose_refinement import PoseRefinement
 from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
 from twofold.metrics.protocols import Networks
-from twofold.outputs.views import Picture
+from twofold.outputs.views import RenderedImage
 from twofold.training.run import load
 
 
@@ -40,7 +40,7 @@ def test_what_is_ignored_spoils_no_figure_and_its_share_is_told(capture, monkeyp
         image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         ignored = frame.ignored()
         color, opacity = torch.where(ignored[..., None], 0.3, image), torch.where(ignored, 0.0, mask)
-        return Picture(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
+        return RenderedImage(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
 
     monkeypatch.setattr(evaluate, "draw_frame", drawn)
     avatar = refined_avatar(())
@@ -62,7 +62,7 @@ def test_what_refined_poses_change_is_told_before_and_after(capture, monkeypatch
         image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         color, opacity = image * (0.9 if refined else 0.5), mask.clone()
         opacity[:14] *= refined
-        return Picture(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
+        return RenderedImage(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
 
     monkeypatch.setattr(evaluate, "draw_frame", drawn)
     figures = evaluate.measure_refinement(refined_avatar(("root", "translation")), capture, 8)
@@ -80,7 +80,7 @@ def test_what_refined_poses_change_is_told_before_and_after(capture, monkeypatch
 def test_without_refinement_there_is_no_before_and_after(capture, monkeypatch, tmp_path):
     def drawn(avatar, capture, frame, refined):
         image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
-        return Picture(image, mask, depth=mask, normal=image, base=image, base_normal=image)
+        return RenderedImage(image, mask, depth=mask, normal=image, base=image, base_normal=image)
 
     monkeypatch.setattr(evaluate, "draw_frame", drawn)
     assert "pose_refinement" not in evaluate.evaluate(refined_avatar(()), capture, tmp_path)
@@ -105,7 +105,7 @@ def test_by_default_a_long_split_is_sampled_evenly_and_the_protocol_says_so(capt
     def drawn(avatar, capture, frame, refined):
         seen.append(frame.time)
         image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
-        return Picture(image, mask, depth=mask, normal=image, base=image, base_normal=image)
+        return RenderedImage(image, mask, depth=mask, normal=image, base=image, base_normal=image)
 
     monkeypatch.setattr(evaluate, "draw_frame", drawn)
     frame = capture.splits["novel_pose"][1]
@@ -123,7 +123,7 @@ def test_by_default_a_long_split_is_sampled_evenly_and_the_protocol_says_so(capt
 
 def exact(avatar, capture, frame, refined):
     image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
-    return Picture(image, mask, depth=mask, normal=image, base=image, base_normal=image)
+    return RenderedImage(image, mask, depth=mask, normal=image, base=image, base_normal=image)
 
 
 def test_protocols_of_papers_and_a_video_are_measured_where_asked_for(capture, monkeypatch, tmp_path):

@@ -28,7 +28,7 @@ def png(width: int, height: int, *after: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + start + b"".join(after) + chunk(b"IEND", b"")
 
 
-def picture(**options) -> Image.Image:
+def image(**options) -> Image.Image:
     return Image.fromarray(np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8), **options)
 
 
@@ -43,13 +43,13 @@ def refusal(read, path) -> str:
 
 @pytest.mark.parametrize("kind", images.FORMATS)
 def test_each_format_is_read_and_known_by_its_content(kind, tmp_path):
-    picture().save(tmp_path / "a.png", kind, **({"lossless": True} if kind == "WEBP" else {}))
+    image().save(tmp_path / "a.png", kind, **({"lossless": True} if kind == "WEBP" else {}))
     header = read_header(tmp_path / "a.png")
     assert (header.width, header.height, header.mode) == (30, 20, "RGB")
     assert load_image(tmp_path / "a.png").size == (30, 20)
     assert read_grey(tmp_path / "a.png").shape == (20, 30)
     if kind != "JPEG":
-        np.testing.assert_array_equal(read_rgb(tmp_path / "a.png"), np.asarray(picture()))
+        np.testing.assert_array_equal(read_rgb(tmp_path / "a.png"), np.asarray(image()))
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF"])
@@ -57,7 +57,7 @@ def test_each_format_is_read_and_known_by_its_content(kind, tmp_path):
 def test_the_size_is_told_the_right_way_up_as_is_the_image(kind, orientation, tmp_path):
     exif = Image.Exif()
     exif[0x0112] = orientation
-    picture().save(tmp_path / "a", kind, exif=exif)
+    image().save(tmp_path / "a", kind, exif=exif)
     assert upright_size(tmp_path / "a") == ((20, 30) if orientation == 6 else (30, 20))
     assert ImageOps.exif_transpose(load_image(tmp_path / "a")).size == upright_size(tmp_path / "a")
 
@@ -74,7 +74,7 @@ def test_nothing_that_starts_another_program_is_opened(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("kind", ["GIF", "PPM", "ICO", "PDF", "TGA", "PCX"])
 def test_other_formats_are_refused(kind, tmp_path):
-    picture().save(tmp_path / "a.png", kind)
+    image().save(tmp_path / "a.png", kind)
     assert "is no image of a known kind (PNG, JPEG, WEBP, TIFF, BMP)" in refusal(load_image, tmp_path / "a.png")
 
 
@@ -100,7 +100,7 @@ def test_what_pillow_verifies_but_cannot_decode_is_damaged(name, tmp_path):
 @pytest.mark.parametrize("kind", images.FORMATS)
 def test_cut_files_are_damaged(kind, tmp_path):
     buffer = io.BytesIO()
-    picture().save(buffer, kind)
+    image().save(buffer, kind)
     for share in (0.1, 0.5, 0.9):
         (tmp_path / "a.png").write_bytes(buffer.getvalue()[: int(share * len(buffer.getvalue()))])
         refusal(read_rgb, tmp_path / "a.png")
@@ -116,7 +116,7 @@ def test_bombs_are_one_sentence_without_a_warning(read, side, tmp_path):
 
 def test_many_threads_leave_the_list_of_warnings_as_it_was(tmp_path):
     (tmp_path / "a.png").write_bytes(png(9_500, 9_500))
-    picture().save(tmp_path / "b.png")
+    image().save(tmp_path / "b.png")
     before = list(warnings.filters)
 
     def read(name: str) -> None:

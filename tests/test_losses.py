@@ -110,13 +110,13 @@ def literal_s3im(color, truth, orders, center=1.5):
     norm = sum(bell) ** 2
     values = []
     for channel in range(3):
-        pictures = [
+        images = [
             [[float(c[order[y * width + x]][channel]) for x in range(width)] for y in range(height)]
             for c in (color, truth)
         ]
 
-        def pixel(picture, y, x, pictures=pictures):
-            return pictures[picture][y][x] if 0 <= y < height and 0 <= x < width else 0.0
+        def pixel(image, y, x, images=images):
+            return images[image][y][x] if 0 <= y < height and 0 <= x < width else 0.0
 
         for top in range(-1, height + 1 - 3, 4):
             for left in range(-1, width + 1 - 3, 4):

@@ -77,14 +77,14 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.texts).split())
 
 
-def picture(seed: int = 0) -> np.ndarray:
+def image(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (12, 9, 3), dtype=np.uint8)
 
 
 def full_page(folder: Path) -> Page:
     (folder / "films").mkdir()
     (folder / "films" / "a turn.mp4").write_bytes(b"film")
-    Image.fromarray(picture(1)).save(folder / "kept.png")
+    Image.fromarray(image(1)).save(folder / "kept.png")
     path = write_report(
         folder,
         "Seed 3",
@@ -93,9 +93,7 @@ def full_page(folder: Path) -> Page:
                 "Unseen views",
                 "First `code`.\n\nSecond, https://example.org/a.",
                 (
-                    Row(
-                        (CaptionedImage(picture(), "truth"), CaptionedImage(folder / "kept.png", "avatar")), "Camera 2"
-                    ),
+                    Row((CaptionedImage(image(), "truth"), CaptionedImage(folder / "kept.png", "avatar")), "Camera 2"),
                     Row((CaptionedImage(torch.zeros(4, 4, 3)), CaptionedImage(torch.ones(4, 4)))),
                 ),
             ),
@@ -111,7 +109,7 @@ def full_page(folder: Path) -> Page:
             KeyMetric("Novel view", "27.3", "dB", "26 dB", True),
             KeyMetric("Pose", "20.1", "dB", "24 dB", False),
         ],
-        lead=CaptionedImage(picture(2)),
+        lead=CaptionedImage(image(2)),
         credit="By nobody.",
     )
     assert path == folder / "report.html"
@@ -135,7 +133,7 @@ def test_images_are_inside_the_page_pixel_by_pixel(tmp_path: Path) -> None:
     sources = [str(a["src"]) for a in images]
     contents = [base64.b64decode(s.removeprefix("data:image/png;base64,"), validate=True) for s in sources]
     arrays = [np.asarray(Image.open(io.BytesIO(content)).convert("RGB")) for content in contents]
-    expected = [picture(2), picture(), picture(1), np.zeros((4, 4, 3)), np.full((4, 4, 3), 255)]
+    expected = [image(2), image(), image(1), np.zeros((4, 4, 3)), np.full((4, 4, 3), 255)]
     assert len(arrays) == len(expected)
     assert all(np.array_equal(a, e) for a, e in zip(arrays, expected, strict=True))
     assert [(a["width"], a["height"]) for a in images[:2]] == [("9", "12"), ("9", "12")]
@@ -158,7 +156,7 @@ def test_no_text_can_break_the_page(tmp_path: Path) -> None:
     evil = "\"'><script>alert(1)</script>&amp;"
     chart = Chart(evil, (Curve(evil, [0, 1], [0.0, 1.0]), Curve("b", [0], [1.0])), x_label=evil)
     parts = (
-        Row((CaptionedImage(picture(), evil),), evil),
+        Row((CaptionedImage(image(), evil),), evil),
         chart,
         Table((evil,), ((evil,), (evil, evil))),
         Commands(((evil, evil),)),

@@ -25,7 +25,7 @@ EQUATIONS = {
     8: "samples along a ray to a pixel",
     9: "reconstruction loss",
     10: "eikonal loss",
-    11: "common loss: the first branch alone explains the picture",
+    11: "common loss: the first branch alone explains the image",
     12: "all losses, weighted",
 }
 

@@ -18,7 +18,7 @@ from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
 from twofold.methods.table import RECIPES, with_settings
 from twofold.outputs.mesh import posed_surface
-from twofold.outputs.views import Picture, draw
+from twofold.outputs.views import RenderedImage, draw
 from twofold.training import loop
 from twofold.training.loop import Progress
 from twofold.training.run import choose_device
@@ -77,7 +77,7 @@ def render(
     pose: Float[Tensor, "24 3"],
     translation: Float[Tensor, "3"] | None = None,
     background: tuple[float, float, float] = BLACK,
-) -> Picture:
+) -> RenderedImage:
     """An image of the avatar in a pose, with opacity, depth, normals, and its pose-independent branch.
 
     Args:

@@ -18,7 +18,7 @@ from twofold.metrics import video as video_metrics
 from twofold.metrics.protocols import Networks, ProtocolMeans
 from twofold.outputs.mesh import posed_surface
 from twofold.outputs.shares import Shares
-from twofold.outputs.views import Picture, draw
+from twofold.outputs.views import RenderedImage, draw
 
 NEAR = 0.5
 """Seconds over which the errors of an estimator's poses last."""
@@ -30,7 +30,7 @@ MAX_IMAGES = 30
 """Images a split that are measured unless more are asked for, evenly spread: a minute or two on two cores."""
 
 
-def draw_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) -> Picture:
+def draw_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) -> RenderedImage:
     """The avatar in a frame's pose from its camera; `refined` applies what was learned about poses at that time."""
     posed = pose_at(avatar, capture, frame) if refined else avatar.pose(frame.pose, frame.translation, None)
     return draw(avatar, posed, frame.camera, torch.tensor(capture.background))
@@ -66,7 +66,7 @@ def sampled(count: int, of: int, what: str) -> str:
 
 def measure_split(
     avatar: Avatar, capture: Capture, split: str, most: int | None = None, refined: bool = False,
-    watch: Callable[[Frame, Picture], None] | None = None,
+    watch: Callable[[Frame, RenderedImage], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """Means of all image metrics over a split's frames.
 
@@ -81,16 +81,16 @@ def measure_split(
     rows, shares = [], []
     frames = spread(capture.splits.get(split, ()), most)
     for frame in frames:
-        picture = draw_frame(avatar, capture, frame, refined)
+        rendered = draw_frame(avatar, capture, frame, refined)
         image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         ignored = frame.ignored()
-        row = image_metrics.compare(picture.color, image, picture.opacity, mask, ignored)
-        if picture.base_opacity is not None:
-            row["base_silhouette_iou"] = image_metrics.silhouette_iou(picture.base_opacity, mask, ignored=ignored)
+        row = image_metrics.compare(rendered.color, image, rendered.opacity, mask, ignored)
+        if rendered.base_opacity is not None:
+            row["base_silhouette_iou"] = image_metrics.silhouette_iou(rendered.base_opacity, mask, ignored=ignored)
         rows.append(row)
         shares.append(ignored[image_metrics.subject_box(mask)].float().mean().item())
         if watch:
-            watch(frame, picture)
+            watch(frame, rendered)
     if not rows:
         return {}
     means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
@@ -142,7 +142,7 @@ def measure_geometry(
 
 def measure_refinement(
     avatar: Avatar, capture: Capture, most: int, trained: dict[str, object] | None = None,
-    watch: Callable[[Frame, Picture], None] | None = None,
+    watch: Callable[[Frame, RenderedImage], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """How far training moved the poses, and the same avatar in the poses before and after, in at most `most` images.
 
@@ -164,11 +164,11 @@ def measure_refinement(
     return found | {"protocol": told}
 
 
-def add_picture(means: ProtocolMeans, capture: Capture, frame: Frame, picture: Picture) -> None:
+def add_picture(means: ProtocolMeans, capture: Capture, frame: Frame, image: RenderedImage) -> None:
     """One rendering more for the table of protocols; pixels that are ignored take the true colours."""
     truth, ignored, mask = frame.composited(torch.tensor(capture.background)), frame.ignored(), frame.mask()
-    color = torch.where(ignored[..., None], truth, picture.color)
-    opacity = torch.where(ignored, mask, picture.opacity)
+    color = torch.where(ignored[..., None], truth, image.color)
+    opacity = torch.where(ignored, mask, image.opacity)
     means.add(color, opacity, mask, capture.background, lambda background: frame.composited(torch.tensor(background)))
 
 
@@ -199,10 +199,10 @@ def measure_consistency(
 
     def rendered() -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
         for frame in frames:
-            picture = draw_frame(avatar, capture, frame, True)
+            image = draw_frame(avatar, capture, frame, True)
             if watch:
                 watch()
-            yield picture.color, frame.composited(torch.tensor(capture.background)), frame.mask()
+            yield image.color, frame.composited(torch.tensor(capture.background)), frame.mask()
 
     figures: dict[str, object] = dict(video_metrics.frame_consistency(rendered()))
     if not figures:
@@ -258,11 +258,11 @@ def measure(
     few = min(most or 8, 8)
     for time in _with_mesh(capture, meshes):
         read_mesh(capture.meshes[time])  # before hours of work
-    pictures = {name: len(spread(capture.splits.get(name, ()), most)) for name in ("novel_view", "novel_pose")}
-    pictures["train"] = len(spread(capture.train, few))
+    images = {name: len(spread(capture.splits.get(name, ()), most)) for name in ("novel_view", "novel_pose")}
+    images["train"] = len(spread(capture.train, few))
     # Training images are drawn once more, in the poses as given; held-out ones in both.
-    refined = pictures["train"] + 2 * min(pictures["novel_pose"], few) if _refines(avatar) else 0
-    pieces = {**pictures, "pose refinement": refined, "geometry": len(_with_mesh(capture, meshes))}
+    refined = images["train"] + 2 * min(images["novel_pose"], few) if _refines(avatar) else 0
+    pieces = {**images, "pose refinement": refined, "geometry": len(_with_mesh(capture, meshes))}
     pieces["consistency"] = len(steady_video(capture)) if networks else 0
     section = ""
     shares = Shares(pieces, {"geometry": _MESH}, lambda share: show(share, section) if show else None)
@@ -276,9 +276,9 @@ def measure(
     for split in ("novel_view", "novel_pose"):
         means = ProtocolMeans(networks) if networks else None
 
-        def seen(frame: Frame, picture: Picture, split: str = split, means: ProtocolMeans | None = means) -> None:
+        def seen(frame: Frame, image: RenderedImage, split: str = split, means: ProtocolMeans | None = means) -> None:
             if means:
-                add_picture(means, capture, frame, picture)
+                add_picture(means, capture, frame, image)
             watch(split)
 
         part = measure_split(avatar, capture, split, most, True, seen)

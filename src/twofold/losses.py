@@ -361,8 +361,8 @@ def _windowed_ssim(first: Tensor, second: Tensor, center: float) -> Tensor:
     bell = torch.exp(-offsets.square() / (2 * S3IM_SIGMA**2))
     window = (bell[:, None] * bell / bell.sum() ** 2)[None, None]
 
-    def mean(picture: Tensor) -> Tensor:
-        return F.conv2d(picture, window, stride=S3IM_WINDOW, padding=1)
+    def mean(image: Tensor) -> Tensor:
+        return F.conv2d(image, window, stride=S3IM_WINDOW, padding=1)
 
     mean1, mean2 = mean(first), mean(second)
     variance1, variance2 = mean(first.square()) - mean1.square(), mean(second.square()) - mean2.square()

@@ -15,7 +15,7 @@ from twofold.errors import TwofoldError
 from twofold.files import write_bytes
 from twofold.html.charts import Chart, Curve, curves_svg
 from twofold.html.page import EmbeddedImage, KeyMetric, Table, embedded_image, render
-from twofold.outputs.sheets import Picture, as_bytes
+from twofold.outputs.sheets import SheetImage, as_bytes
 
 __all__ = [
     "CaptionedImage", "Chart", "Commands", "Curve", "KeyMetric", "Row", "Section", "Table", "Video",
@@ -31,7 +31,7 @@ MISSING = "\N{EN DASH}"
 class CaptionedImage:
     """An image, put into the page, with a caption: a file (PNG, JPEG, WebP) or colours."""
 
-    image: Path | Picture
+    image: Path | SheetImage
     caption: str = ""
 
 

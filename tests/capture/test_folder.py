@@ -30,8 +30,8 @@ def test_a_capture_reads_back_as_it_was_written(tiny):
         np.testing.assert_array_equal(capture.body.arrays()[name], array)
     poses, translations = tiny_motion()
     for split, cameras in SPLITS.items():
-        pictures = [(camera, time) for camera, times in cameras.items() for time in times]
-        assert [(f.camera_name, f.time) for f in capture.splits[split]] == pictures
+        images = [(camera, time) for camera, times in cameras.items() for time in times]
+        assert [(f.camera_name, f.time) for f in capture.splits[split]] == images
         for frame in capture.splits[split]:
             assert torch.equal(frame.pose, poses[frame.time])
             assert torch.equal(frame.translation, translations[frame.time])
@@ -57,7 +57,7 @@ def test_the_documented_example_is_faultless(tiny):
     (tiny / "capture.json").write_text(page.split("```json\n")[1].split("```")[0])
     contents, faults = read_contents(tiny)
     assert faults == []
-    assert contents.pictures == {"front": [0, 1, 2, 3, 4, 5], "side": [0, 2, 4, 5]}
+    assert contents.images == {"front": [0, 1, 2, 3, 4, 5], "side": [0, 2, 4, 5]}
     joints = joint_positions(contents)
     assert joints is not None
     for camera in contents.cameras.values():

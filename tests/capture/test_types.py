@@ -23,9 +23,9 @@ def test_a_frame_reads_colours_and_mask_as_shares_of_one(tiny):
 def test_a_grey_image_and_a_bilevel_mask_are_read_as_well(tiny):
     frame = read_capture(tiny).train[0]
     Image.fromarray(np.full((40, 48), 51, np.uint8)).save(frame.image_file)
-    with Image.open(frame.mask_file) as picture:
+    with Image.open(frame.mask_file) as image:
         before = frame.mask()
-        bilevel = picture.convert("1")
+        bilevel = image.convert("1")
     bilevel.save(frame.mask_file)
     assert frame.image().unique().tolist() == [torch.tensor(0.2).item()]
     torch.testing.assert_close(frame.mask(), before)

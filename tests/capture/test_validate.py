@@ -137,8 +137,8 @@ def test_unused_images_need_not_be_there(tiny, describe):
 
 @pytest.mark.parametrize("kind", ["images", "masks"])
 def test_a_wrong_sized_image_is_named(tiny, kind):
-    with Image.open(tiny / f"{kind}/front/000001.png") as picture:
-        smaller = picture.resize((20, 10))
+    with Image.open(tiny / f"{kind}/front/000001.png") as image:
+        smaller = image.resize((20, 10))
     smaller.save(tiny / f"{kind}/front/000001.png")
     assert f"{kind}/front/000001.png has 20 x 10 pixels, its camera 48 x 40" in only(validate(tiny))
 
@@ -146,8 +146,8 @@ def test_a_wrong_sized_image_is_named(tiny, kind):
 @pytest.mark.parametrize(("kind", "mode"), [("masks", "RGB"), ("masks", "P"), ("images", "I;16"), ("images", "P")])
 def test_an_image_of_the_wrong_kind_is_named(tiny, kind, mode):
     path = tiny / f"{kind}/front/000001.png"
-    with Image.open(path) as picture:
-        changed = picture.convert("I").convert("I;16") if mode == "I;16" else picture.convert(mode)
+    with Image.open(path) as image:
+        changed = image.convert("I").convert("I;16") if mode == "I;16" else image.convert(mode)
     changed.save(path)
     assert f"it is of the kind {mode}" in only(validate(tiny))
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from filmed import MOMENTS, motion
 
-from twofold.check.conventions import best_moment, diagnose, poses_elsewhere, sample_of
+from twofold.check.conventions import best_shift, diagnose, poses_elsewhere, sample_of
 from twofold.check.frame_measures import mirrored_pose, posed_points, turned_round
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle, rigid_inverse
 
@@ -122,9 +122,9 @@ def test_mirrored_and_turned_images_are_recognised(samples, side):
 
 def _mirrored(sample):
     """From pixels of a mirrored image to pixels of a mirrored window."""
-    picture = torch.tensor([[-1.0, 0, sample.placed.width - 1], [0, 1, 0], [0, 0, 1]])
+    image = torch.tensor([[-1.0, 0, sample.placed.width - 1], [0, 1, 0], [0, 0, 1]])
     window = torch.tensor([[-1.0, 0, sample.mask.shape[1] - 1], [0, 1, 0], [0, 0, 1]])
-    return window @ sample.to_window @ picture
+    return window @ sample.to_window @ image
 
 
 def _turned(sample, side):
@@ -158,7 +158,7 @@ def test_a_motion_that_is_early_or_late_is_found(turner_read, turner_points, lat
     poses, translations = motion()
     moved = [t.roll(late, 0) for t in (poses, translations)]
     frames = [replace(f, pose=moved[0][f.time], translation=moved[1][f.time]) for f in turner_read.train]
-    found, gain, share = best_moment([sample_of(f, turner_points) for f in frames], *moved)
+    found, gain, share = best_shift([sample_of(f, turner_points) for f in frames], *moved)
     assert found == late
     assert (gain > 0.1, share > 0.9) == (late != 0, late != 0)
 

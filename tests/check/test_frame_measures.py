@@ -169,8 +169,8 @@ def test_a_mask_twice_as_large_and_to_the_right_is_told(turner_read, turner_shap
 def test_blur_takes_the_details(turner_read, turner_shaped, turner_points, tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (96, 96, 3), dtype=np.uint8)
     found = []
-    for name, picture in (("sharp", noise), ("soft", ndimage.gaussian_filter(noise, (2, 2, 0)))):
-        Image.fromarray(picture).save(tmp_path / f"{name}.png")
+    for name, image in (("sharp", noise), ("soft", ndimage.gaussian_filter(noise, (2, 2, 0)))):
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
         frame = replace(turner_read.train[2], image_file=tmp_path / f"{name}.png")
         found.append(frame_facts(frame, "train", turner_shaped, turner_points).sharpness)
     assert found[1] < 0.2 * found[0]

@@ -19,8 +19,8 @@ def filmed(turner_read, tmp_path, change):
     """The first training frames with images changed by a function of their bytes and number."""
     frames = []
     for number, frame in enumerate(turner_read.train[:4]):
-        with Image.open(frame.image_file) as picture:
-            image = change(np.array(picture), number)
+        with Image.open(frame.image_file) as original:
+            image = change(np.array(original), number)
         Image.fromarray(image).save(tmp_path / f"{number}.png")
         frames.append(replace(frame, image_file=tmp_path / f"{number}.png"))
     return frames
@@ -78,10 +78,10 @@ def test_a_face_is_seen_where_the_head_is_and_only_there(turner_read, turner_sha
     # The photograph that scikit-image brings: a face 100 pixels wide in the middle of this part.
     face = Image.fromarray(data.astronaut()[20:220, 120:320])
     size = round(0.4 * float(camera.intrinsics[0, 0]) / float(depth))
-    picture = Image.new("RGB", (768, 768), (90, 120, 100))
+    image = Image.new("RGB", (768, 768), (90, 120, 100))
     turned = face.resize((size, size)).rotate(-57.3 * -lean, fillcolor=(90, 120, 100))
-    picture.paste(turned, (round(float(place[0])) - size // 2, round(float(place[1])) - size // 2))
-    picture.save(tmp_path / "image.png")
+    image.paste(turned, (round(float(place[0])) - size // 2, round(float(place[1])) - size // 2))
+    image.save(tmp_path / "image.png")
     assert sees_a_face(frame, turner_shaped)
     Image.new("RGB", (768, 768), (90, 120, 100)).save(tmp_path / "image.png")
     assert not sees_a_face(frame, turner_shaped)

@@ -154,7 +154,7 @@ def test_one_camera_that_is_wrong_is_named(turner):
 def test_a_motion_that_is_late_is_named(turner):
     move(turner, lambda arrays: {k: np.roll(arrays[k], 2, 0) for k in ("poses", "translations")})
     found = topics(turner, most=20)
-    assert "2 frames later" in found["moments"].what
+    assert "2 frames later" in found["delay"].what
     assert "bad frames" not in found
 
 
@@ -219,12 +219,12 @@ def test_the_page_stands_alone_and_no_name_breaks_it(turner, tmp_path):
 def test_overlays_tint_left_limbs_orange_and_right_ones_blue(turner_read, turner_shaped, tmp_path):
     Image.new("RGB", (96, 96)).save(tmp_path / "black.png")
     frame = replace(turner_read.train[0], image_file=tmp_path / "black.png")
-    picture = overlay(frame, turner_shaped, side_of_faces(turner_shaped), (90, 120)).astype(int)
-    assert picture.shape == (120, 90, 3)
-    red, blue = (picture[..., k] - picture[..., 2 - k] for k in (0, 2))
+    image = overlay(frame, turner_shaped, side_of_faces(turner_shaped), (90, 120)).astype(int)
+    assert image.shape == (120, 90, 3)
+    red, blue = (image[..., k] - image[..., 2 - k] for k in (0, 2))
     # It faces the camera, so its left is at the right.
     assert np.nonzero(red > 60)[1].mean() > np.nonzero(blue > 60)[1].mean() + 15
-    assert ((picture[..., :2].min(-1) > 170) & (picture[..., 2] < 150)).sum() > 50
+    assert ((image[..., :2].min(-1) > 170) & (image[..., 2] < 150)).sum() > 50
 
 
 def test_faults_that_differ_in_their_frame_are_one():

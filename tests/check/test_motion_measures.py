@@ -37,7 +37,7 @@ def test_a_smooth_motion_has_no_jumps(facts):
     found = facts()
     assert found.jumps == ()
     assert found.jitter < 0.03
-    assert found.moments == tuple(range(MOMENTS))
+    assert found.frames == tuple(range(MOMENTS))
     assert found.up > 0.99
 
 

@@ -72,7 +72,7 @@ CASES = {
     "pieces": ("warning", lambda f: masks(f, 3, loose=0.2)),
     "cropped": ("warning", lambda f: masks(f, 10, borders=("left",))),
     "sides unseen": ("warning", lambda f: moving(f, seen=200.0, unseen="back")),
-    "few images": ("warning", lambda f: replace(f, pictures=f.pictures | {"train": 12})),
+    "few images": ("warning", lambda f: replace(f, images=f.images | {"train": 12})),
     "poses": ("warning", lambda f: moving(f, poses=2)),
     "novel poses": ("note", lambda f: moving(f, novelty=3.0)),
     "up": ("note", lambda f: moving(f, up=0.1)),
@@ -86,7 +86,7 @@ CASES = {
     "blur": ("note", lambda f: each(f, 1, sharpness=0.0)),
     "size": ("warning", lambda f: each(f, size_ratio=1.5)),
     "offset": ("warning", lambda f: each(f, offset=(0.0, -0.2))),
-    "moments": ("warning", lambda f: replace(f, moment=(3, 0.04))),
+    "delay": ("warning", lambda f: replace(f, delay=(3, 0.04))),
 }
 
 
@@ -105,10 +105,10 @@ SERIOUS = {
     "scale": lambda f: replace(f, stature=1700.0),
     "inverted masks": lambda f: masks(f, share=0.9, border_share=1.0),
     "cropped": lambda f: each(masks(f, borders=("bottom",)), body_outside=0.5),
-    "few images": lambda f: replace(f, pictures=f.pictures | {"train": 5}),
+    "few images": lambda f: replace(f, images=f.images | {"train": 5}),
     "disagreement": lambda f: cameras(each(f, iou=0.4), iou=0.4),
     "jumps": lambda f: moving(f, jumps=tuple(range(20))),
-    "moments": lambda f: replace(each(f, iou=0.5), moment=(-2, 0.3)),
+    "delay": lambda f: replace(each(f, iou=0.5), delay=(-2, 0.3)),
     "faces": lambda f: replace(f, backs=(("front", 1),) * 6, faces=(("front", 1),) * 5),
 }
 

@@ -70,9 +70,9 @@ def film(folder, **changes):
             for name, camera in cameras().items():
                 hits = rasterize(supersampled(camera, 3), vertices, body.faces)
                 seen = (paint[body.faces[hits.face]] * hits.barycentric[..., None]).sum(1)
-                picture = box_filter(camera, 3, hits.pixel, torch.cat([seen, torch.ones(len(seen), 1)], -1))
-                mask = picture[..., 3:]
-                image = picture[..., :3] + (1 - mask) * behind
+                original = box_filter(camera, 3, hits.pixel, torch.cat([seen, torch.ones(len(seen), 1)], -1))
+                mask = original[..., 3:]
+                image = original[..., :3] + (1 - mask) * behind
                 writer.image(name, time, (255 * image).round().to(torch.uint8).numpy())
                 writer.mask(name, time, (255 * mask[..., 0]).round().to(torch.uint8).numpy())
         arguments = {
@@ -101,6 +101,6 @@ def describe(folder: Path, change):
 def each_mask(folder: Path, change):
     """Changes all masks by a function of their bytes and frame."""
     for path in sorted((folder / "masks").rglob("*.png")):
-        with Image.open(path) as picture:
-            mask = np.array(picture)
+        with Image.open(path) as image:
+            mask = np.array(image)
         Image.fromarray(change(mask, int(path.stem))).save(path)

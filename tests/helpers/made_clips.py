@@ -34,7 +34,7 @@ def grey(level: int, height: int = 48, width: int = 64) -> np.ndarray:
 
 
 def write_clip(
-    path: Path, pictures: Sequence[np.ndarray], fps: int = 25, seconds: Sequence[float] | None = None,
+    path: Path, images: Sequence[np.ndarray], fps: int = 25, seconds: Sequence[float] | None = None,
     pixel_aspect: str | None = None, first_to_last: bool = False,
 ) -> Path:  # fmt: skip
     """An H.264 (or MPEG-4) video; `first_to_last` puts what a reader needs first at the beginning of an MP4."""
@@ -42,14 +42,14 @@ def write_clip(
     options = {"movflags": "faststart"} if first_to_last else {}
     with av.open(str(path), "w", options=options) as file:
         stream = file.add_stream(codec, rate=fps)
-        stream.height, stream.width = pictures[0].shape[:2]
+        stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = Fraction(1, 10000)
         stream.options = {"crf": "12"} if codec == "libx264" else {"qscale": "2"}
         if pixel_aspect:
             stream.codec_context.sample_aspect_ratio = Fraction(pixel_aspect)
-        for index, picture in enumerate(pictures):
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p")
+        for index, image in enumerate(images):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format="yuv420p")
             frame.pts = round(10000 * (index / fps if seconds is None else seconds[index]))
             frame.time_base = Fraction(1, 10000)
             file.mux(stream.encode(frame))

@@ -107,9 +107,9 @@ def write_person(folder: Path) -> Path:
                 hits = rasterize(supersampled(camera, FACTOR), vertices, body.faces)
                 seen = (colors[body.faces[hits.face]] * hits.barycentric[..., None]).sum(1)
                 values = torch.cat([seen, torch.ones(len(seen), 1)], -1)
-                picture = box_filter(camera, FACTOR, hits.pixel, values)
-                mask = picture[..., 3]
-                image = picture[..., :3] + (1 - mask[..., None]) * torch.tensor(BACKGROUND)
+                original = box_filter(camera, FACTOR, hits.pixel, values)
+                mask = original[..., 3]
+                image = original[..., :3] + (1 - mask[..., None]) * torch.tensor(BACKGROUND)
                 writer.image(name, time, (255 * image).round().to(torch.uint8).numpy())
                 writer.mask(name, time, (255 * mask).round().to(torch.uint8).numpy())
         writer.finish(

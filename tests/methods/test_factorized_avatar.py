@@ -109,7 +109,7 @@ def trained_with(trained, **options):
     return other
 
 
-def pictures(avatar, person):
+def images(avatar, person):
     frame = person.splits["novel_view"][0]
     return draw(avatar, avatar.pose(frame.pose, frame.translation), frame.camera.resized(32, 32), BLACK)
 
@@ -119,7 +119,7 @@ def test_error_bounded_and_shell_sampler_draw_the_same_image(trained, person):
     shell = ShellSampler(radius=0.06, step=0.004, voxel=0.02, min_weight=0.0)
     bounded = ErrorBoundedSampler(ends="ray")
     first, second = (
-        pictures(trained_with(trained, sampler=s, outlier_distance=shell.radius), person) for s in (shell, bounded)
+        images(trained_with(trained, sampler=s, outlier_distance=shell.radius), person) for s in (shell, bounded)
     )
     difference = (first.color - second.color).abs()
     assert first.opacity.mean() > 0.1
@@ -130,14 +130,14 @@ def test_error_bounded_and_shell_sampler_draw_the_same_image(trained, person):
 def test_samples_left_out_for_their_small_weight_are_not_missed(trained, person):
     sampler = trained_with(trained).config.sampler
     all_, some = (
-        pictures(trained_with(trained, sampler=replace(sampler, min_weight=least)), person) for least in (0.0, 1e-3)
+        images(trained_with(trained, sampler=replace(sampler, min_weight=least)), person) for least in (0.0, 1e-3)
     )
     assert (all_.color - some.color).abs().max() < 0.02
 
 
 @pytest.mark.parametrize("neighbours", [2, 7])
 def test_weights_of_several_neighbours_draw_nearly_the_same(trained, person, neighbours):
-    one, several = (pictures(trained_with(trained, neighbours=k), person) for k in (1, neighbours))
+    one, several = (images(trained_with(trained, neighbours=k), person) for k in (1, neighbours))
     difference = (one.color - several.color).abs()
     assert 0 < difference.mean() < 0.03
 

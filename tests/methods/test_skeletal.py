@@ -158,13 +158,13 @@ def test_render_is_the_equations_sample_by_sample(avatar, person):
 
 def test_unlikely_samples_may_be_left_out(subject, person):
     frame, rays = person.train[1], rays_of(person.train[1], 12)
-    pictures = []
+    images = []
     for threshold in (None, 1e-4, 2e-2):
         avatar = built(RECIPE, subject, min_likelihood=threshold)
         with torch.no_grad():
-            pictures.append(avatar.render(rays, avatar.pose(frame.pose, frame.translation), BACKGROUND).color)
-    assert (pictures[1] - pictures[0]).abs().max() < 2e-3
-    assert (pictures[2] - pictures[0]).abs().mean() < 5e-3
+            images.append(avatar.render(rays, avatar.pose(frame.pose, frame.translation), BACKGROUND).color)
+    assert (images[1] - images[0]).abs().max() < 2e-3
+    assert (images[2] - images[0]).abs().mean() < 5e-3
 
 
 def test_losses_are_means_over_patch_images_and_single_rays(avatar, person):

@@ -52,9 +52,9 @@ def folder(published, tmp_path_factory):
 def literal_lpips(first, second, vgg, linear, kept=None):
     """Layer by layer through torchvision's numbering, one image at a time; `kept` is what a dropout of half keeps."""
 
-    def features(picture):
+    def features(image):
         shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
-        x = ((2 * picture - 1) - shift[:, None, None]) / scale[:, None, None]
+        x = ((2 * image - 1) - shift[:, None, None]) / scale[:, None, None]
         x, found = x[None], []
         for number in range(30):
             if number in NUMBERS:

@@ -42,8 +42,8 @@ def test_image_is_that_of_the_slow_rasterizer(samples: int) -> None:
 def test_texture_shows_what_the_vertices_have() -> None:
     plain = small_character(texture=0)
     textured = small_character(texture=512)
-    pictures = [draw_mesh(c, c.vertices, camera(), BACKGROUND) for c in (plain, textured)]
-    assert np.abs(pictures[0] - pictures[1]).mean() < 0.01
+    images = [draw_mesh(c, c.vertices, camera(), BACKGROUND) for c in (plain, textured)]
+    assert np.abs(images[0] - images[1]).mean() < 0.01
 
 
 def test_headlight_darkens_what_turns_away() -> None:
@@ -58,6 +58,6 @@ def test_headlight_darkens_what_turns_away() -> None:
 
 def test_mesh_behind_the_camera_is_not_seen() -> None:
     character = small_character(texture=0)
-    picture = draw_mesh(character, character.vertices + np.array([0, 0, 9], np.float32), camera(), BACKGROUND)
-    assert (picture[..., 3] == 0).all()
-    assert np.abs(picture[..., :3] - BACKGROUND).max() < 1e-6
+    image = draw_mesh(character, character.vertices + np.array([0, 0, 9], np.float32), camera(), BACKGROUND)
+    assert (image[..., 3] == 0).all()
+    assert np.abs(image[..., :3] - BACKGROUND).max() < 1e-6

@@ -13,20 +13,20 @@ def noise(seed: int, height: int = 40, width: int = 30) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
-def place(page: np.ndarray, picture: np.ndarray) -> tuple[int, int]:
+def place(page: np.ndarray, image: np.ndarray) -> tuple[int, int]:
     """Row and column of the one place where the page shows exactly this image."""
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     windows = np.lib.stride_tricks.sliding_window_view(page, (height, width, 3))[:, :, 0]
-    hits = np.argwhere((windows[..., 0, 0, :] == picture[0, 0]).all(-1))
-    found = [(int(i), int(j)) for i, j in hits if np.array_equal(page[i : i + height, j : j + width], picture)]
+    hits = np.argwhere((windows[..., 0, 0, :] == image[0, 0]).all(-1))
+    found = [(int(i), int(j)) for i, j in hits if np.array_equal(page[i : i + height, j : j + width], image)]
     assert len(found) == 1
     return found[0]
 
 
 def test_every_image_stands_in_its_row_and_column() -> None:
-    pictures = [[noise(3 * i + j) for j in range(3)] for i in range(2)]
-    page = sheet(pictures, ["first", "a second one"], ["truth", "full", "base"], title="Seed 7", footer="By nobody")
-    places = np.array([[place(page, p) for p in row] for row in pictures])
+    images = [[noise(3 * i + j) for j in range(3)] for i in range(2)]
+    page = sheet(images, ["first", "a second one"], ["truth", "full", "base"], title="Seed 7", footer="By nobody")
+    places = np.array([[place(page, p) for p in row] for row in images])
     assert (places[:, :, 0] == places[:, :1, 0]).all(), "one height in a row"
     assert (places[:, :, 1] == places[:1, :, 1]).all(), "one left edge in a column"
     assert (np.diff(places[:, 0, 0]) > 40).all()
@@ -44,8 +44,8 @@ def test_labels_are_written_beside_the_images_not_over_them() -> None:
     assert ink(sheet(rows, row_labels=["pose"])) > 20
     assert ink(sheet(rows, column_labels=["truth", "full"])) > 20
     assert ink(sheet(rows, title="Title")) > 20
-    picture = noise(1)
-    place(sheet([[picture]], ["a very long label that has to be broken"], ["wider than its image"]), picture)
+    image = noise(1)
+    place(sheet([[image]], ["a very long label that has to be broken"], ["wider than its image"]), image)
 
 
 def test_text_is_never_cut_off() -> None:

@@ -50,9 +50,9 @@ def test_players_are_told_rate_format_and_color_matrix(tmp_path: Path) -> None:
 
 
 def test_added_column_repeats_the_last(tmp_path: Path) -> None:
-    picture = np.zeros((33, 33, 3), dtype=np.uint8)
-    picture[:, 16:] = 200
-    write_video(tmp_path / "v.mp4", [picture], fps=10)
+    image = np.zeros((33, 33, 3), dtype=np.uint8)
+    image[:, 16:] = 200
+    write_video(tmp_path / "v.mp4", [image], fps=10)
     (back,) = read_back(tmp_path / "v.mp4")
     assert np.abs(back[:, 33].astype(int) - 200).max() <= 4
 

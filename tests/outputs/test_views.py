@@ -71,14 +71,14 @@ def test_each_pixel_is_what_its_ray_sees_and_the_rest_is_background(with_base, c
     avatar = Painted(with_base)
     posed = avatar.pose(*some_pose())
     camera = side_camera(posed)
-    picture = draw(avatar, posed, camera, BACKGROUND, chunk)
+    image = draw(avatar, posed, camera, BACKGROUND, chunk)
     vertices = posed.body.vertices
     low, high = vertices.amin(0) - 0.35, vertices.amax(0) + 0.35
     followed = 0
     for row, column in pixel_grid(camera).flip(-1).flatten(0, 1).long().tolist():
         ray = pixel_rays(camera, torch.tensor([[column, row]]).float())
         clipped, hit = clip_to_box(ray, low, high)
-        here = picture.color[row, column]
+        here = image.color[row, column]
         if hit:
             followed += 1
             expected = (0.7 + 0.5 * ray.directions[0]).clamp(0, 1)
@@ -87,9 +87,9 @@ def test_each_pixel_is_what_its_ray_sees_and_the_rest_is_background(with_base, c
         else:
             values = BACKGROUND, torch.tensor(0.0), torch.tensor(0.0), torch.zeros(3)
             beneath = BACKGROUND, torch.zeros(3)
-        found = here, picture.opacity[row, column], picture.depth[row, column], picture.normal[row, column]
+        found = here, image.opacity[row, column], image.depth[row, column], image.normal[row, column]
         torch.testing.assert_close(found, values, atol=1e-5, rtol=0)
-        torch.testing.assert_close((picture.base[row, column], picture.base_normal[row, column]), beneath)
+        torch.testing.assert_close((image.base[row, column], image.base_normal[row, column]), beneath)
     assert 30 < followed < 12 * 18, "both kinds of pixels are there"
     assert sum(map(len, avatar.asked)) == followed
     assert chunk is None or max(map(len, avatar.asked)) == chunk
@@ -113,17 +113,17 @@ def test_camera_that_looks_away_sees_background():
     posed = avatar.pose(*some_pose())
     eye = posed.body.vertices.mean(0) + torch.tensor([0.0, 0, 3])
     away = look_at(eye, eye + torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 1, 0]))
-    picture = draw(avatar, posed, Camera(away, side_camera(posed).intrinsics, 8, 9), BACKGROUND)
-    assert torch.equal(picture.color, BACKGROUND.expand(8, 9, 3))
+    image = draw(avatar, posed, Camera(away, side_camera(posed).intrinsics, 8, 9), BACKGROUND)
+    assert torch.equal(image.color, BACKGROUND.expand(8, 9, 3))
     assert sum(map(len, avatar.asked)) == 0
 
 
 def test_residual_is_what_the_base_lacks():
     avatar = Painted()
     posed = avatar.pose(*some_pose())
-    picture = draw(avatar, posed, side_camera(posed), BACKGROUND)
-    assert torch.equal(picture.residual, picture.color - BACKGROUND)
-    assert picture.residual.abs().max() > 0.1
+    image = draw(avatar, posed, side_camera(posed), BACKGROUND)
+    assert torch.equal(image.residual, image.color - BACKGROUND)
+    assert image.residual.abs().max() > 0.1
     alone = draw(Painted(with_base=False), posed, side_camera(posed), BACKGROUND)
     assert not alone.residual.any()
 

@@ -165,11 +165,11 @@ def test_turning_the_world_changes_no_image():
         before = pose_body(body, poses[time], translations[time]).vertices
         after = pose_body(body, turned[time], moved[time]).vertices
         torch.testing.assert_close(after, before @ rotation.T, atol=1e-5, rtol=0)
-        pictures = [
+        images = [
             project(Camera(camera, intrinsics, HEIGHT, WIDTH), points)[0]
             for camera, points in ((world_to_camera, before), (turned_camera, after))
         ]
-        torch.testing.assert_close(*pictures, atol=1e-3, rtol=0)
+        torch.testing.assert_close(*images, atol=1e-3, rtol=0)
 
 
 def broken(prepared, tmp_path, **changes):

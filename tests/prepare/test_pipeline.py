@@ -80,8 +80,8 @@ def test_the_world_is_turned_but_no_image_changes(tmp_path, monkeypatch):
     torch.testing.assert_close(shown, expected, atol=0.02, rtol=0)
     frame = read_capture(tmp_path / "me").train[9]
     assert frame.image_file.suffix == ".jpg"
-    with Image.open(stage.clips[0] / f"{frame.time:03d}.png") as picture:
-        assert np.abs(np.asarray(picture) / 255 - frame.image().numpy()).mean() < 0.02
+    with Image.open(stage.clips[0] / f"{frame.time:03d}.png") as image:
+        assert np.abs(np.asarray(image) / 255 - frame.image().numpy()).mean() < 0.02
     cleaned = clean_mask(stage.evidence["cam0"].masks[frame.time])
     assert np.array_equal((255 * frame.mask().numpy()).round(), cleaned)
 
@@ -185,8 +185,8 @@ def test_objects_leave_the_mask_and_are_stored_as_ignored(tmp_path, monkeypatch)
         ImageDraw.Draw(mask).ellipse(box, fill=255)
         stage.spoil(time, np.asarray(mask))
         path = stage.clips[0] / f"{time:03d}.png"
-        with Image.open(path) as picture:
-            image = picture.convert("RGB")
+        with Image.open(path) as original:
+            image = original.convert("RGB")
         ImageDraw.Draw(image).ellipse(box, fill=(20, 240, 30))
         image.save(path)
     stage.is_understood(monkeypatch)
@@ -233,8 +233,8 @@ def test_own_masks_and_poses_take_the_place_of_what_is_found(tmp_path, monkeypat
     assert done.mean("iou") > 0.99
     assert validate(tmp_path / "me") == []
     mask = read_capture(tmp_path / "me").train[3].mask().numpy()
-    with Image.open(own / "003.png") as picture:
-        assert np.array_equal((255 * mask).round(), np.asarray(picture))
+    with Image.open(own / "003.png") as image:
+        assert np.array_equal((255 * mask).round(), np.asarray(image))
 
 
 def test_own_landmarks_take_the_place_of_those_found(tmp_path, monkeypatch):
@@ -265,8 +265,8 @@ def test_masks_that_fit_two_countings_are_compared_with_the_images(tmp_path, mon
     (sentence,) = [warning for warning in done.warnings if "fit the clip in 2 ways" in warning]
     assert "taken as counted from 0" in sentence
     mask = read_capture(tmp_path / "me").train[3].mask().numpy()
-    with Image.open(own / "mask003.png") as picture:
-        assert np.array_equal((255 * mask).round(), np.asarray(picture))
+    with Image.open(own / "mask003.png") as image:
+        assert np.array_equal((255 * mask).round(), np.asarray(image))
 
 
 def test_the_estimator_sees_the_person_of_the_own_masks_alone(tmp_path, monkeypatch):

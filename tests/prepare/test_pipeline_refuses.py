@@ -125,9 +125,9 @@ def test_several_people_are_refused_unless_told_otherwise(tmp_path, monkeypatch,
     stage, shown = Stage(tmp_path / "clips", 14), []
     stage.is_understood(monkeypatch)
 
-    def crowd(pictures):
-        shown.extend(pictures)
-        return People((2,) * len(pictures))
+    def crowd(images):
+        shown.extend(images)
+        return People((2,) * len(images))
 
     config = replace(PLAIN, several_people=refuse)
     if refuse == "ignore":

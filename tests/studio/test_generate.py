@@ -50,7 +50,7 @@ def digests(folder):
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def pictures(folder, kind):
+def images(folder, kind):
     return {path.relative_to(folder / kind): np.asarray(Image.open(path)) for path in (folder / kind).rglob("*.png")}
 
 
@@ -148,7 +148,7 @@ def test_noise_on_the_poses_leaves_the_truth_alone(folder, spoiled):
 
 
 def test_imperfect_masks_are_wrong_a_little(folder, spoiled):
-    true, given = pictures(folder, "masks"), pictures(spoiled, "masks")
+    true, given = images(folder, "masks"), images(spoiled, "masks")
     overlaps = []
     for name in true:
         a, b = true[name] > 127, given[name] > 127
@@ -159,8 +159,8 @@ def test_imperfect_masks_are_wrong_a_little(folder, spoiled):
 
 
 def test_a_textured_background_stands_behind_the_same_person(folder, spoiled):
-    plain, textured = pictures(folder, "images"), pictures(spoiled, "images")
-    masks = pictures(folder, "masks")
+    plain, textured = images(folder, "images"), images(spoiled, "images")
+    masks = images(folder, "masks")
     for name, image in textured.items():
         assert (image[masks[name] == 255] == plain[name][masks[name] == 255]).all()
         behind = image[masks[name] == 0].astype(float)

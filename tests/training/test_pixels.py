@@ -67,7 +67,7 @@ def test_an_image_that_ignores_all_of_the_person_is_one_sentence(hidden, tmp_pat
     capture = read_capture(write_tiny(tmp_path / "tiny", ignored={("front", 0): layer}))
     source = PixelSource(capture.train, capture.body, capture.betas, PixelConfig())
     with pytest.raises(TwofoldError, match="ignores all of the person"):
-        source.picture(0)
+        source.image(0)
 
 
 def test_nothing_ignored_draws_as_if_there_were_no_layer(hidden):
@@ -170,12 +170,12 @@ def test_single_pixels_come_from_the_box_around_the_subject_and_from_around_the_
 
 @pytest.mark.parametrize("margin", [0.0, 0.1, 0.3])
 def test_reachable_pixels_are_those_near_the_body_or_the_mask(noisy, margin):
-    found = source_of(noisy, margin=margin).picture(0).reachable.long()
+    found = source_of(noisy, margin=margin).image(0).reachable.long()
     assert torch.equal(found, brute_reachable(noisy, margin).flatten().nonzero()[:, 0])
 
 
 def test_surroundings_are_so_many_pixels_around_the_mask(noisy):
-    found = source_of(noisy, surroundings=3, margin=5.0).picture(0).subject.long().tolist()
+    found = source_of(noisy, surroundings=3, margin=5.0).image(0).subject.long().tolist()
     inside = (noisy.train[0].mask() > 0.5).nonzero().tolist()
     expected = [
         row * WIDTH + column
@@ -292,13 +292,13 @@ def test_released_pools_are_the_box_of_the_joints_and_the_mask_without_its_last_
     joints = pose_body(shape_body(far.body, far.betas), frame.pose, frame.translation).joints
     hit = literal_box_hits(frame, joints, 0.3142)
     assert 0.1 < hit.float().mean() < 0.9
-    picture = source.picture(0)
-    assert picture.reachable.tolist() == hit.flatten().nonzero()[:, 0].tolist()
+    image = source.image(0)
+    assert image.reachable.tolist() == hit.flatten().nonzero()[:, 0].tolist()
     any_ = frame.mask() > 0
     rows, columns = [sorted(set(axis.tolist())) for axis in any_.nonzero(as_tuple=True)]
     box = [r * WIDTH + c for r in range(rows[0], rows[-1]) for c in range(columns[0], columns[-1]) if hit[r, c]]
-    assert picture.subject.tolist() == box
-    assert torch.equal(picture.inside, any_)
+    assert image.subject.tolist() == box
+    assert torch.equal(image.inside, any_)
 
 
 def test_released_pixels_are_drawn_once_and_not_rounded(far):

@@ -57,17 +57,17 @@ def test_browser_skins_and_morphs_like_twofold(kind: str, tmp_path: Path) -> Non
         own = pose_character(character, clip.poses[frame], clip.translations[frame], clip.weights[frame])
         assert np.abs(np.array(shown["points"]) - own[character.atlas.vertex][::every]).max() < 1e-4
         save(shown["image"], tmp_path / f"{kind}-{frame}.png")
-        with Image.open(tmp_path / f"{kind}-{frame}.png") as picture:
-            assert (np.asarray(picture.convert("RGB")) < 250).mean() > 0.01, "nothing is to be seen"
+        with Image.open(tmp_path / f"{kind}-{frame}.png") as image:
+            assert (np.asarray(image.convert("RGB")) < 250).mean() > 0.01, "nothing is to be seen"
     if kind == "vrm":
         assert set(REQUIRED) <= set(found["bones"])
         assert found["meta"]["authors"] == ["Grace"]
         assert found["meta"]["allowRedistribution"] is False
 
 
-def save(picture: str, file: Path) -> None:
+def save(image: str, file: Path) -> None:
     """Writes a data URL as a file, and a copy for people where TWOFOLD_PICTURES names a folder."""
-    content = base64.b64decode(picture.partition(",")[2])
+    content = base64.b64decode(image.partition(",")[2])
     file.write_bytes(content)
     if folder := os.environ.get("TWOFOLD_PICTURES"):
         (Path(folder) / file.name).write_bytes(content)

@@ -21,11 +21,11 @@ from twofold.capture.layout import (
     DESCRIPTION,
     FORMAT,
     IGNORED,
+    IMAGE_ENDINGS,
     IMAGES,
     MASKS,
     MESHES,
     MOTION,
-    PICTURE_ENDINGS,
     VERSION,
     Contents,
     file_stem,
@@ -59,9 +59,9 @@ def capture_of(contents: Contents) -> Capture:
     body, betas, poses, translations = contents.body, contents.betas, contents.poses, contents.translations
     if body is None or betas is None or poses is None or translations is None:
         raise AssertionError("a part that cannot be read is a fault, and faults are raised before")
-    images = {camera: contents.files(IMAGES, camera) for camera in contents.pictures}
-    masks = {camera: contents.files(MASKS, camera) for camera in contents.pictures}
-    ignored = {camera: contents.files(IGNORED, camera) for camera in contents.pictures}
+    images = {camera: contents.files(IMAGES, camera) for camera in contents.images}
+    masks = {camera: contents.files(MASKS, camera) for camera in contents.images}
+    ignored = {camera: contents.files(IGNORED, camera) for camera in contents.images}
     splits = {
         split: tuple(
             Frame(
@@ -74,9 +74,9 @@ def capture_of(contents: Contents) -> Capture:
                 mask_file=masks[name][time],
                 ignored_file=ignored[name].get(time),
             )
-            for name, time in pictures
+            for name, time in image_files
         )
-        for split, pictures in contents.splits.items()
+        for split, image_files in contents.splits.items()
     }
     meshes = numbered_files(folder / MESHES, (".npz",))
     return Capture(
@@ -139,15 +139,15 @@ class CaptureWriter:
 
     def image(self, camera: str, time: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """One 8-bit sRGB image, as PNG."""
-        self._picture(IMAGES, camera, time, image)
+        self._image(IMAGES, camera, time, image)
 
     def mask(self, camera: str, time: int, mask: UInt8[np.ndarray, "h w"]) -> None:
         """Its mask, 0 outside .. 255 on the person, as PNG."""
-        self._picture(MASKS, camera, time, mask)
+        self._image(MASKS, camera, time, mask)
 
     def ignored(self, camera: str, time: int, ignored: UInt8[np.ndarray, "h w"]) -> None:
         """Where nobody knows what the person looks like there (255, else 0), as PNG; images may do without."""
-        self._picture(IGNORED, camera, time, ignored)
+        self._image(IGNORED, camera, time, ignored)
 
     def image_file(self, camera: str, time: int, source: Path) -> None:
         """An image file (PNG or JPEG) taken over as it is, so that nothing is lost in coding it anew."""
@@ -253,7 +253,7 @@ class CaptureWriter:
             raise RuntimeError("A CaptureWriter is used in a `with` block.")
         return self._partial
 
-    def _picture(self, kind: str, camera: str, time: int, pixels: np.ndarray) -> None:
+    def _image(self, kind: str, camera: str, time: int, pixels: np.ndarray) -> None:
         buffer = io.BytesIO()
         # The lowest level is several times as fast and a fifth larger.
         Image.fromarray(pixels).save(buffer, format="PNG", compress_level=1)
@@ -261,8 +261,8 @@ class CaptureWriter:
 
     def _copy(self, kind: str, camera: str, time: int, source: Path) -> None:
         ending = source.suffix.lower()
-        if ending not in PICTURE_ENDINGS:
-            raise TwofoldError(f"{source} should be one of {', '.join(PICTURE_ENDINGS)}; save it as PNG.")
+        if ending not in IMAGE_ENDINGS:
+            raise TwofoldError(f"{source} should be one of {', '.join(IMAGE_ENDINGS)}; save it as PNG.")
         require_file(source)  # a device would be copied without end
         self._put(f"{kind}/{camera}/{file_stem(time)}{ending}", source)
 

@@ -28,7 +28,7 @@ DESCRIPTION, BODY, MOTION = "capture.json", "body.npz", "motion.npz"
 IMAGES, MASKS, IGNORED, MESHES = "images", "masks", "ignored", "meshes"
 CHECK = "check"
 """What `twofold check` found lies here; nothing reads it."""
-PICTURE_ENDINGS = (".png", ".jpg", ".jpeg")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 """Camera names are folder names, so nothing that leaves the folder or breaks on another system."""
 MAX_SIDE = 32_768
@@ -71,17 +71,17 @@ class Contents:
     translations: Float[Tensor, "T 3"] | None
 
     @property
-    def pictures(self) -> dict[str, list[int]]:
+    def images(self) -> dict[str, list[int]]:
         """Frames that any split shows, by camera, in order."""
         wanted: dict[str, set[int]] = {}
-        for pictures in self.splits.values():
-            for camera, time in pictures:
+        for images in self.splits.values():
+            for camera, time in images:
                 wanted.setdefault(camera, set()).add(time)
         return {camera: sorted(times) for camera, times in wanted.items()}
 
     def files(self, kind: str, camera: str) -> dict[int, Path]:
         """The images there are of one camera, by time; `kind` is "images", "masks" or "ignored"."""
-        return numbered_files(self.folder / kind / camera, PICTURE_ENDINGS)
+        return numbered_files(self.folder / kind / camera, IMAGE_ENDINGS)
 
 
 def numbered_files(folder: Path, endings: tuple[str, ...]) -> dict[int, Path]:
@@ -281,7 +281,7 @@ def _split(
     split: str, given: Any, cameras: set[str], moments: int | None, faults: list[str]
 ) -> tuple[tuple[str, int], ...]:
     where = f"{DESCRIPTION}: split {split}"
-    pictures: list[tuple[str, int]] = []
+    images: list[tuple[str, int]] = []
     for entry in given if isinstance(given, list) else [None]:
         if not isinstance(entry, dict) or not isinstance(entry.get("times"), list):
             faults.append(f'{where} should be a list of {{"camera": name, "times": [numbers]}}.')
@@ -301,11 +301,11 @@ def _split(
             faults.append(
                 f"{where}: camera {camera} shows times {spans(beyond)}, {MOTION} ends at {(moments or 0) - 1}."
             )
-        pictures += [(camera, time) for time in times if time not in beyond]
-    twice = [time for (_, time), count in Counter(pictures).items() if count > 1]
+        images += [(camera, time) for time in times if time not in beyond]
+    twice = [time for (_, time), count in Counter(images).items() if count > 1]
     if twice:
         faults.append(f"{where} names the same image twice at times {spans(twice)}; once is enough.")
-    return tuple(dict.fromkeys(pictures))
+    return tuple(dict.fromkeys(images))
 
 
 def _read_body(folder: Path, faults: list[str]) -> Body | None:

@@ -28,8 +28,8 @@ def leave_out(folder: Path | str, images: Iterable[tuple[str, int]]) -> list[tup
     contents, faults = read_contents(folder)
     require(faults, folder)
     unfit = set(images)
-    before = {split: set(pictures) for split, pictures in contents.splits.items()}
-    after = {split: pictures - unfit for split, pictures in before.items()}
+    before = {split: set(chosen) for split, chosen in contents.splits.items()}
+    after = {split: chosen - unfit for split, chosen in before.items()}
     times = {time for _, time in after["train"]}
     if len(times) < 2:
         raise TwofoldError(
@@ -38,7 +38,7 @@ def leave_out(folder: Path | str, images: Iterable[tuple[str, int]]) -> list[tup
         )
     after["novel_view"] = {(camera, time) for camera, time in after["novel_view"] if time in times}
     description: dict[str, Any] = read_json(folder / DESCRIPTION)
-    description["splits"] = {split: _entries(pictures) for split, pictures in after.items()}
+    description["splits"] = {split: _entries(chosen) for split, chosen in after.items()}
     gone = sorted(set[tuple[str, int]]().union(*before.values()) - set[tuple[str, int]]().union(*after.values()))
     notes = description.get("notes")
     notes = dict(notes) if isinstance(notes, dict) else {}
@@ -48,8 +48,8 @@ def leave_out(folder: Path | str, images: Iterable[tuple[str, int]]) -> list[tup
     return gone
 
 
-def _entries(pictures: Iterable[tuple[str, int]]) -> list[dict[str, Any]]:
+def _entries(images: Iterable[tuple[str, int]]) -> list[dict[str, Any]]:
     times: dict[str, list[int]] = {}
-    for camera, time in sorted(pictures):
+    for camera, time in sorted(images):
         times.setdefault(camera, []).append(time)
     return [{"camera": camera, "times": group} for camera, group in times.items()]

@@ -79,7 +79,7 @@ def require(faults: list[str], folder: Path | str, shown: int = 8) -> None:
 def quick_faults(contents: Contents) -> list[str]:
     """What files' names, image headers and projected joints show: missing, wrong-sized, behind, outside."""
     faults: list[str] = []
-    for camera_name, times in contents.pictures.items():
+    for camera_name, times in contents.images.items():
         for kind, modes in ((IMAGES, _IMAGE_MODES), (MASKS, _MASK_MODES), (IGNORED, _MASK_MODES)):
             there = contents.files(kind, camera_name)
             missing = [time for time in times if time not in there]
@@ -129,7 +129,7 @@ def _placement_faults(contents: Contents) -> list[str]:
     if joints is None:
         return []
     faults: list[str] = []
-    for name, times in contents.pictures.items():
+    for name, times in contents.images.items():
         camera = contents.cameras.get(name)
         shown = [time for time in times if time < len(joints)]
         if camera is None or not shown:
@@ -154,7 +154,7 @@ def pixel_faults(contents: Contents) -> list[str]:
     """What only the pixels show: damaged images, empty or full masks, masks that the body is nowhere near."""
     joints = joint_positions(contents)
     faults: list[str] = []
-    for name, times in contents.pictures.items():
+    for name, times in contents.images.items():
         images, masks = contents.files(IMAGES, name), contents.files(MASKS, name)
         shown, size = dict[int, ShownJoints](), (0, 0)
         if name in contents.cameras:

@@ -35,15 +35,15 @@ def agreement(facts: Facts) -> Iterator[Finding]:
         return
     explained = [finding for doubt in facts.doubts for finding in _convention(doubt, facts)]
     iou = float(np.mean([f.iou for f in frames]))
-    moment, gain = facts.moment
-    if moment and not explained:
-        late = "later" if moment > 0 else "earlier"
+    delay, gain = facts.delay
+    if delay and not explained:
+        late = "later" if delay > 0 else "earlier"
         explained.append(
             Finding(
                 graded(iou < LEAST_IOU),
-                "moments",
-                f"Images fit the poses of {counted(abs(moment), 'frame')} {late} better, by {gain:.2f} in IoU",
-                f"Move the rows of motion.npz by {-moment:+d}, or rename the images.",
+                "delay",
+                f"Images fit the poses of {counted(abs(delay), 'frame')} {late} better, by {gain:.2f} in IoU",
+                f"Move the rows of motion.npz by {-delay:+d}, or rename the images.",
             )
         )
     yield from explained

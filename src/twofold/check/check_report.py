@@ -91,14 +91,14 @@ def overlay(
     """
     image, mask = read_bytes(frame)
     look = look_at(frame, shaped, mask, max(cell), cell[0] / cell[1])
-    picture = look.window.image(image).astype(np.float32)
-    flat = picture.reshape(-1, 3)
+    canvas = look.window.image(image).astype(np.float32)
+    flat = canvas.reshape(-1, 3)
     pixel = look.hits.pixel.numpy()
     flat[pixel] = 0.5 * flat[pixel] + 0.5 * TINTS[sides[look.hits.face.numpy()]]
-    picture = np.where(look.known[..., None], picture, 0.4 * picture + 0.6 * IGNORED)
+    canvas = np.where(look.known[..., None], canvas, 0.4 * canvas + 0.6 * IGNORED)
     edge = look.mask & ~np.asarray(ndimage.binary_erosion(look.mask, border_value=1), dtype=bool)
-    picture[edge] = OUTLINE
-    stored = Image.fromarray(picture.round().astype(np.uint8))
+    canvas[edge] = OUTLINE
+    stored = Image.fromarray(canvas.round().astype(np.uint8))
     return np.asarray(ImageOps.pad(stored, cell, color=(18, 20, 24)))
 
 
@@ -118,7 +118,7 @@ def _plain(value: Any) -> Any:
 
 
 def _page(facts: Facts, capture: Capture, judgement: Judgement) -> bytes:
-    total = sum(facts.pictures.values())
+    total = sum(facts.images.values())
     checked = f"{len(facts.frames)} of {total} images checked, " if len(facts.frames) < total else ""
     about = (
         f"{checked}{counted(total, 'image')}, {counted(len(facts.cameras), 'camera')}, {facts.fps:g} frames per second"
@@ -166,7 +166,7 @@ def _key_metrics(facts: Facts) -> list[KeyMetric]:
         KeyMetric("Body on mask", f"{mean:.2f}", "IoU", f"{GOOD_IOU:g} or more", mean >= GOOD_IOU),
         KeyMetric("Badly fitted", f"{bad}", f"of {len(ious)}", "none", bad == 0),
         KeyMetric("Sides seen", f"{facts.motion.seen:.0f}", "degrees", f"{SEEN:g} or more", facts.motion.seen >= SEEN),
-        KeyMetric("Training images", f"{facts.pictures['train']}"),
+        KeyMetric("Training images", f"{facts.images['train']}"),
         KeyMetric("Height", f"{facts.stature:.2f}" if facts.stature < 100 else f"{facts.stature:.0f}", "m"),
     ]
 
@@ -237,7 +237,7 @@ def _cameras(facts: Facts) -> Table:
             (
                 camera.name,
                 f"{camera.iou:.2f}",
-                f"{camera.looked_at} of {camera.pictures}",
+                f"{camera.looked_at} of {camera.images}",
                 f"{camera.view_angle:.1f}°",
                 f"{camera.distance:.2f} m",
                 f"{camera.off_center:.1%} off centre",

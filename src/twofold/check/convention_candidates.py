@@ -125,7 +125,7 @@ def _camera(change: Callable[[Tensor], Tensor]) -> Callable[[Placed], Placed]:
     return lambda p: replace(p, world_to_camera=change(p.world_to_camera))
 
 
-def _picture(change: Callable[[int, int], Sequence[Sequence[float | int]]]) -> Callable[[Placed], Placed]:
+def _image(change: Callable[[int, int], Sequence[Sequence[float | int]]]) -> Callable[[Placed], Placed]:
     """Images whose pixels are stored in another order; `change` takes height and width."""
 
     def changed(p: Placed) -> Placed:
@@ -231,7 +231,7 @@ CONVENTIONS: tuple[Convention, ...] = (
         "images mirrored", "images and masks are mirrored left to right against body and cameras",
         "mirror them back or, where writing in the images reads well, mirror poses, translations and cameras",
         "picture",
-        _picture(lambda h, w: ((-1, 0, w - 1), (0, 1, 0), (0, 0, 1))),
+        _image(lambda h, w: ((-1, 0, w - 1), (0, 1, 0), (0, 0, 1))),
     ),
     Convention(
         "pose mirrored", "the whole pose is mirrored, root and all",
@@ -307,19 +307,19 @@ CONVENTIONS: tuple[Convention, ...] = (
     ),
     Convention(
         "upside-down images", "images and masks stand on their heads", "rotate them by 180 degrees", "picture",
-        _picture(lambda h, w: ((-1, 0, w - 1), (0, -1, h - 1), (0, 0, 1))),
+        _image(lambda h, w: ((-1, 0, w - 1), (0, -1, h - 1), (0, 0, 1))),
     ),
     Convention(
         "rows from the bottom", "the rows of images and masks run from the bottom up", "turn them over", "picture",
-        _picture(lambda h, w: ((1, 0, 0), (0, -1, h - 1), (0, 0, 1))),
+        _image(lambda h, w: ((1, 0, 0), (0, -1, h - 1), (0, 0, 1))),
     ),
     Convention(
         "images turned right", "images and masks are turned by a quarter, clockwise, against the camera",
-        "turn them back by a quarter", "picture", _picture(lambda h, w: ((0, -1, w - 1), (1, 0, 0), (0, 0, 1))),
+        "turn them back by a quarter", "picture", _image(lambda h, w: ((0, -1, w - 1), (1, 0, 0), (0, 0, 1))),
     ),
     Convention(
         "images turned left", "images and masks are turned by a quarter, anticlockwise, against the camera",
-        "turn them back by a quarter", "picture", _picture(lambda h, w: ((0, 1, 0), (-1, 0, h - 1), (0, 0, 1))),
+        "turn them back by a quarter", "picture", _image(lambda h, w: ((0, 1, 0), (-1, 0, h - 1), (0, 0, 1))),
     ),
     Convention(
         "camera rolled right", "the camera is rolled by a quarter against its images",

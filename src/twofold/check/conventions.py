@@ -127,7 +127,7 @@ def diagnose(samples: Sequence[Sample], size_ratio: float = 1.0) -> Diagnosis:
     return Diagnosis(float(given.mean()), best, float(found.mean()), better_in)
 
 
-def best_moment(
+def best_shift(
     samples: Sequence[Sample], poses: Float[Tensor, "T 24 3"], translations: Float[Tensor, "T 3"]
 ) -> tuple[int, float, float]:
     """By how many frames the motion is late (or early, below 0), judged by which poses fit the masks best.

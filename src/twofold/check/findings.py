@@ -87,13 +87,13 @@ def places(frames: Iterable[FrameFacts]) -> str:
     return places_of((f.camera, f.time) for f in frames)
 
 
-def places_of(pictures: Iterable[tuple[str, int]]) -> str:
+def places_of(images: Iterable[tuple[str, int]]) -> str:
     """Cameras and times in few words.
 
     >>> places_of([("a", 1), ("a", 2), ("b", 7)])
     'camera a at 1-2; camera b at 7'
     """
     times: dict[str, list[int]] = defaultdict(list)
-    for camera, time in pictures:
+    for camera, time in images:
         times[camera].append(time)
     return "; ".join(f"camera {camera} at {spans(group)}" for camera, group in sorted(times.items()))

@@ -31,7 +31,7 @@ class Background:
 
     Attributes:
         times: frames that were compared with the first.
-        shift: the largest movement, as a share of the image's longer side; None where it cannot be told.
+        shift: the largest movement, as a share of the image's longer side; None where it is unknown.
         brightness: at each of these frames relative to the first; empty where nothing could be compared.
         lost: there is a background with details, but it cannot be followed from image to image.
     """

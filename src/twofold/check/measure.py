@@ -18,7 +18,7 @@ from twofold.capture.folder import capture_of
 from twofold.capture.layout import Contents, read_contents, spans
 from twofold.capture.types import Capture, Frame, spread
 from twofold.capture.validate import mesh_faults, pixel_faults, quick_faults
-from twofold.check.conventions import Diagnosis, best_moment, diagnose, poses_elsewhere, sample_of
+from twofold.check.conventions import Diagnosis, best_shift, diagnose, poses_elsewhere, sample_of
 from twofold.check.findings import counted
 from twofold.check.frame_measures import FrameFacts, frame_facts, stature, surface_points
 from twofold.check.image_measures import Background, background_of, sees_a_face, shows_its_back
@@ -44,7 +44,7 @@ class CameraFacts:
 
     Attributes:
         name: of the camera.
-        pictures: that any split shows.
+        images: that any split shows.
         looked_at: of these.
         iou: mean over these.
         view_angle: across the longer side, degrees.
@@ -54,7 +54,7 @@ class CameraFacts:
     """
 
     name: str
-    pictures: int
+    images: int
     looked_at: int
     iou: float
     view_angle: float
@@ -85,7 +85,7 @@ class Facts:
         folder: where it lies.
         credit: whom to name.
         fps: frames per second.
-        pictures: in all splits, by split.
+        images: in all splits, by split.
         train_times: frames that train.
         stature: of the person, metres.
         frames: the images that were looked at.
@@ -95,7 +95,7 @@ class Facts:
         backs: views from behind in which a face was looked for.
         faces: those in which one was found.
         doubts: what would fit better.
-        moment: by how many frames the motion is late, and what the IoU gains with it.
+        delay: by how many frames the motion is late, and what the IoU gains with it.
         elsewhere: camera and time of images that show the pose of another frame, and that frame.
         twins: test images whose bytes equal a training image's: split, camera, time.
         repeated: training frames whose image equals the one before.
@@ -105,7 +105,7 @@ class Facts:
     folder: Path
     credit: str
     fps: float
-    pictures: dict[str, int]
+    images: dict[str, int]
     train_times: frozenset[int]
     stature: float
     frames: tuple[FrameFacts, ...]
@@ -115,7 +115,7 @@ class Facts:
     backs: tuple[tuple[str, int], ...]
     faces: tuple[tuple[str, int], ...]
     doubts: tuple[Doubt, ...]
-    moment: tuple[int, float]
+    delay: tuple[int, float]
     elsewhere: tuple[tuple[str, int, int], ...]
     twins: tuple[tuple[str, str, int], ...]
     repeated: tuple[int, ...]
@@ -155,7 +155,7 @@ def measure_capture(
     sound = [f for f in looked if not inverted(f)]
     poses, translations = _motion(contents)
     samples = [sample_of(by_place[f.camera, f.time], points) for f in spread(sound, MOMENT_SAMPLES)]
-    moment, gain, _ = best_moment(samples, poses, translations)
+    delay, gain, _ = best_shift(samples, poses, translations)
     elsewhere: list[tuple[str, int, int]] = []
     bad = [f for f in sound if f.iou < POOR]
     if len(bad) < 0.5 * len(sound):
@@ -176,7 +176,7 @@ def measure_capture(
         folder=folder,
         credit=capture.credit,
         fps=capture.fps,
-        pictures={split: len(frames) for split, frames in capture.splits.items()},
+        images={split: len(frames) for split, frames in capture.splits.items()},
         train_times=frozenset(frame.time for frame in capture.train),
         stature=stature(shaped),
         frames=tuple(looked),
@@ -186,7 +186,7 @@ def measure_capture(
         backs=tuple((f.camera_name, f.time) for f in backs),
         faces=tuple((f.camera_name, f.time) for f in backs if sees_a_face(f, shaped)),
         doubts=doubts,
-        moment=(moment, gain),
+        delay=(delay, gain),
         elsewhere=tuple(elsewhere),
         twins=_twins(capture),
         repeated=_repeated(capture.train),
@@ -199,7 +199,7 @@ def _usable(folder: Path) -> Contents:
     """A capture's contents, if there is no fault in them."""
     contents, faults = read_contents(folder)
     thinned = contents
-    if sum(map(len, contents.pictures.values())) > MOST_VALIDATED:
+    if sum(map(len, contents.images.values())) > MOST_VALIDATED:
         thinned = replace(
             contents, splits={k: tuple(spread(v, MOST_VALIDATED // 3)) for k, v in contents.splits.items()}
         )
@@ -289,7 +289,7 @@ def _cameras(
         facts.append(
             CameraFacts(
                 name=name,
-                pictures=len(contents.pictures[name]),
+                images=len(contents.images[name]),
                 looked_at=len(group),
                 iou=float(np.mean([f.iou for f in group])),
                 view_angle=float(np.degrees(2 * np.arctan(longer / 2 / across))),

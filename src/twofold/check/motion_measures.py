@@ -39,7 +39,7 @@ class MotionFacts:
     """What the motion shows.
 
     Attributes:
-        moments: that any split shows.
+        frames: that any split shows.
         jumps: frames that no person could get to from the one before and after.
         jitter: how far joints deviate from the middle between their neighbours, median, metres.
         ranges: for each limb of `LIMBS` how far its joint turns between any two training frames, degrees.
@@ -54,7 +54,7 @@ class MotionFacts:
         up: the body's own up against the world's y axis, mean cosine.
     """
 
-    moments: tuple[int, ...]
+    frames: tuple[int, ...]
     jumps: tuple[int, ...]
     jitter: float
     ranges: tuple[float, ...]
@@ -105,7 +105,7 @@ def motion_facts(
     upward = torch.nn.functional.normalize(placed[:, 12] - placed[:, 0], dim=-1)[times, 1]
     sides = sides_seen(np.radians(azimuths))
     return MotionFacts(
-        moments=tuple(times),
+        frames=tuple(times),
         jumps=tuple(jumps),
         jitter=float(np.median(np.concatenate(deviations))) if any(map(len, deviations)) else 0.0,
         ranges=_ranges(rotations[few]),
@@ -209,7 +209,7 @@ def _different(rotations: Float[Tensor, "t 24 3 3"]) -> int:
     """How many poses differ from all that were counted before."""
     apart = _apart(rotations, rotations).amax(-1)
     kept: list[int] = []
-    for moment in range(len(rotations)):
-        if not kept or float(apart[moment, kept].min()) > NEW_POSE:
-            kept.append(moment)
+    for frame in range(len(rotations)):
+        if not kept or float(apart[frame, kept].min()) > NEW_POSE:
+            kept.append(frame)
     return len(kept)

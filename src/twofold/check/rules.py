@@ -54,7 +54,7 @@ def judge(facts: Facts) -> Judgement:
     """Findings about everything that was measured."""
     found = [*agreement(facts), *_scale(facts), *_masks(facts), *_sides_and_poses(facts), *_motion(facts)]
     found += [finding for camera in facts.cameras for finding in _camera(camera)]
-    found += [*_backgrounds(facts), *_pictures(facts)]
+    found += [*_backgrounds(facts), *_images(facts)]
     found = _merged(found)
     known = {topic for f in found if f.level == "fault" for topic in FOLLOWS.get(f.topic, ())}
     order: tuple[Level, ...] = ("fault", "warning", "note")
@@ -207,7 +207,7 @@ def _sides_and_poses(facts: Facts) -> Iterator[Finding]:
             f"{motion.turned:.0f} before them; its {motion.unseen} is hardly seen and will be invented",
             "Let the person turn round, or train on more cameras.",
         )
-    train = facts.pictures["train"]
+    train = facts.images["train"]
     if train < FEW:
         yield Finding(
             graded(train < FEWEST),
@@ -253,7 +253,7 @@ def _motion(facts: Facts) -> Iterator[Finding]:
     rest = [t for t in motion.jumps if t not in facts.train_times]
     if trained:
         yield Finding(
-            graded(len(trained) > MOST_BAD * len(motion.moments)),
+            graded(len(trained) > MOST_BAD * len(motion.frames)),
             "jumps",
             f"{counted(len(trained), 'frame')} cannot be reached in time from the one before: failed or exchanged "
             "frames, or a wrong `fps`",
@@ -308,7 +308,7 @@ def _backgrounds(facts: Facts) -> Iterator[Finding]:
             )
 
 
-def _pictures(facts: Facts) -> Iterator[Finding]:
+def _images(facts: Facts) -> Iterator[Finding]:
     if facts.twins:
         yield Finding(
             "warning",

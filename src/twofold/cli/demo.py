@@ -128,7 +128,7 @@ def _fill(out: Path, seed: int, config: StudioConfig, recipe: Recipe, show: Call
     metrics = evaluate(avatar, capture, run, most=9, meshes=2)
     lap("evaluation")
     show(0.82, "drawing")
-    pictures = _pictures(avatar, capture, out)
+    images = _images(avatar, capture, out)
     lap("pictures")
     if not missing_packages(EXPORT.config):
         export(avatar, capture, out, EXPORT, lambda done, note: show(0.86 + 0.14 * done, note or "exporting"))
@@ -136,12 +136,12 @@ def _fill(out: Path, seed: int, config: StudioConfig, recipe: Recipe, show: Call
     seconds["total"] = time.monotonic() - begun
     metrics["seconds"] = {**seconds, "protocol": "wall-clock time of the parts of this demo on this machine"}
     write_json(out / "metrics.json", metrics)
-    page = _page(out, seed, metrics, curve, pictures)
+    page = _page(out, seed, metrics, curve, images)
     show(1.0, "done")
     return page
 
 
-def _pictures(avatar: Avatar, capture: Capture, out: Path) -> list[Path]:
+def _images(avatar: Avatar, capture: Capture, out: Path) -> list[Path]:
     folder = out / "pictures"
     save_png(folder / "novel_view.png", comparison(avatar, capture, _one_each(capture.splits["novel_view"])))
     save_png(folder / "novel_pose.png", comparison(avatar, capture, _one_each(capture.splits["novel_pose"])))
@@ -151,7 +151,7 @@ def _pictures(avatar: Avatar, capture: Capture, out: Path) -> list[Path]:
     save_png(folder / "canonical.png", sheet([list(p.values()) for p in parts], ["front", "back"], list(parts[0])))
     frame = capture.train[0]
     turning = orbit_frames(avatar, avatar.pose(frame.pose, frame.translation), capture, 256, 24, scene_up(capture))
-    write_video(folder / "orbit.mp4", (to_8bit(picture.color).numpy() for picture in turning), 12)
+    write_video(folder / "orbit.mp4", (to_8bit(image.color).numpy() for image in turning), 12)
     write_video(folder / "novel_pose.mp4", motion_frames(avatar, capture, "novel_pose", 192), 6)
     return [
         folder / name for name in ("novel_view.png", "novel_pose.png", "canonical.png", "orbit.mp4", "novel_pose.mp4")
@@ -168,10 +168,8 @@ def _one_each(frames: tuple[Frame, ...]) -> list[Frame]:
     return chosen or spread(frames, 3)
 
 
-def _page(
-    out: Path, seed: int, metrics: dict[str, object], curve: list[tuple[int, float]], pictures: list[Path]
-) -> Path:
-    by_name = {path.stem if path.suffix == ".png" else path.name: path for path in pictures}
+def _page(out: Path, seed: int, metrics: dict[str, object], curve: list[tuple[int, float]], images: list[Path]) -> Path:
+    by_name = {path.stem if path.suffix == ".png" else path.name: path for path in images}
     steps, values = [step for step, _ in curve], [value for _, value in curve]
     shown = "Ground truth, the avatar, its pose-independent base, the pose-dependent residual, normals, opacity."
     sections = [

@@ -40,7 +40,7 @@ def tune_process() -> None:
     """Threads that wait give up their core, denormals are flushed, and freed memory is kept for the next step.
 
     Waiting: OpenMP's threads spin between two pieces of work. Where something else wants a core too, each spins while
-    the other is not running, and small pieces take ten times as long. Only a process without torch so far can be told.
+    the other is not running, and small pieces take ten times as long. This can be set only before torch is loaded.
     Memory: glibc returns large blocks to the system and fetches them again zeroed, page by page, at every step.
     Call it before the first parallel operation; elsewhere than on Linux that part is left out.
     """

@@ -54,7 +54,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         self, config: OwnConfig, subject: Subject, seed: int,
         build_field: Callable[[PosedBody, int, torch.Generator], OwnField],
     ) -> None:  # fmt: skip
-        """Builds the field: around a canonical body, conditioned on so many numbers, drawn from a generator."""
+        """Builds the field: around a canonical body, conditioned on this many numbers, drawn from a generator."""
         super().__init__()
         self.config, self.subject = config, subject
         self.refinement = PoseRefinement(subject.times, len(subject.betas), tuple(config.pose.refine))

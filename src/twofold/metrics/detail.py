@@ -56,7 +56,7 @@ def ms_ssim(
         )
     count = sum(side // 2**scale >= GAUSSIAN_WINDOW for scale in range(len(SCALE_WEIGHTS)))
     total = sum(SCALE_WEIGHTS[:count])
-    x, y = (to_8bit(picture, truncate).double() / 255 for picture in (image, truth))
+    x, y = (to_8bit(original, truncate).double() / 255 for original in (image, truth))
     product = torch.ones(3, dtype=torch.float64)
     for scale in range(count):
         luminance, structure = similarity_parts(x, y, data_range)
@@ -90,7 +90,7 @@ def gradient_error(
     >>> round(gradient_error(edge / 5 + 0.4, edge / 5), 6), gradient_error(edge.flip(1), edge)
     (0.0, 1.0)
     """
-    x, y = (to_8bit(picture, truncate).double() / 255 for picture in (image, truth))
+    x, y = (to_8bit(original, truncate).double() / 255 for original in (image, truth))
     weight = torch.ones(x.shape[:2], dtype=torch.float64) if inside is None else inside.double()
     errors: list[Tensor] = []
     while len(errors) < GRADIENT_SCALES and (not errors or min(x.shape[:2]) > 1):
@@ -107,5 +107,5 @@ def gradient_error(
     return torch.stack(errors).mean().item()
 
 
-def _halved(picture: Float[Tensor, "h w c"]) -> Float[Tensor, "H W c"]:
-    return avg_pool2d(picture.movedim(-1, 0), 2).movedim(0, -1) if min(picture.shape[:2]) > 1 else picture
+def _halved(image: Float[Tensor, "h w c"]) -> Float[Tensor, "H W c"]:
+    return avg_pool2d(image.movedim(-1, 0), 2).movedim(0, -1) if min(image.shape[:2]) > 1 else image

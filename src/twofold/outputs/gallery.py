@@ -19,7 +19,7 @@ from twofold.metrics.image import subject_box
 from twofold.outputs.shares import Shares
 from twofold.outputs.sheets import as_bytes, color_normals, residual_picture, sheet
 from twofold.outputs.video import write_video
-from twofold.outputs.views import Picture, draw, orbit, pose_canonically
+from twofold.outputs.views import RenderedImage, draw, orbit, pose_canonically
 
 Item = TypeVar("Item")
 _ROWS = 5
@@ -39,9 +39,9 @@ def save_preview(avatar: Avatar, capture: Capture, folder: Path, step: int) -> N
     frame = capture.train[(step // 7) % len(capture.train)]
     height = min(256, frame.camera.height)
     camera = frame.camera.resized(height, round(frame.camera.width * height / frame.camera.height))
-    picture = draw(avatar, avatar.pose(frame.pose, frame.translation, frame.time), camera, _background(capture))
+    image = draw(avatar, avatar.pose(frame.pose, frame.translation, frame.time), camera, _background(capture))
     true = Image.fromarray(as_bytes(frame.image())).resize((camera.width, height), Image.Resampling.BOX)
-    parts = [np.asarray(true), *(panels(picture)[name] for name in ("full", "normals"))]
+    parts = [np.asarray(true), *(panels(image)[name] for name in ("full", "normals"))]
     save_png(folder / "previews" / f"{step:06d}.png", np.concatenate(parts, 1))
 
 
@@ -49,27 +49,27 @@ def _background(capture: Capture) -> Tensor:
     return torch.tensor(capture.background)
 
 
-def panels(picture: Picture) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
+def panels(image: RenderedImage) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
     """What a rendering is made of, as images: full, base, residual, normals of both, opacity."""
     parts = {
-        "full": picture.color,
-        "base": picture.base,
-        "residual": residual_picture(picture.color, picture.base),
-        "normals": color_normals(picture.normal, picture.opacity),
-        "base normals": color_normals(picture.base_normal, picture.opacity),
-        "opacity": picture.opacity,
+        "full": image.color,
+        "base": image.base,
+        "residual": residual_picture(image.color, image.base),
+        "normals": color_normals(image.normal, image.opacity),
+        "base normals": color_normals(image.base_normal, image.opacity),
+        "opacity": image.opacity,
     }
     return {name: as_bytes(part) for name, part in parts.items()}
 
 
 def beside_truth(
     avatar: Avatar, capture: Capture, frame: Frame, chunk: int | None = None
-) -> tuple[UInt8[np.ndarray, "h w 3"], Picture]:
+) -> tuple[UInt8[np.ndarray, "h w 3"], RenderedImage]:
     """A frame's own image on the background, and the avatar's."""
     background = _background(capture)
     posed = avatar.pose(frame.pose, frame.translation)
-    picture = draw(avatar, posed, frame.camera, background, chunk)
-    return as_bytes(shown_truth(frame, background)), picture
+    image = draw(avatar, posed, frame.camera, background, chunk)
+    return as_bytes(shown_truth(frame, background)), image
 
 
 def shown_truth(frame: Frame, background: Float[Tensor, "3"]) -> Float[Tensor, "h w 3"]:
@@ -89,8 +89,8 @@ def comparison(
     labels: list[str] = []
     columns: list[str] = []
     for frame in frames:
-        true, picture = beside_truth(avatar, capture, frame, chunk)
-        parts = {"truth": true, **panels(picture)}
+        true, image = beside_truth(avatar, capture, frame, chunk)
+        parts = {"truth": true, **panels(image)}
         columns = list(parts)
         where = _around(frame.mask())
         rows.append([part[where] for part in parts.values()])
@@ -108,7 +108,7 @@ def _around(mask: Float[Tensor, "h w"]) -> tuple[slice, slice]:
 def orbit_frames(
     avatar: Avatar, posed: PosedAvatar, capture: Capture, size: int, views: int, up: Float[Tensor, "3"] | None = None,
     chunk: int | None = None,
-) -> Iterator[Picture]:  # fmt: skip
+) -> Iterator[RenderedImage]:  # fmt: skip
     """Images from all around."""
     for camera in orbit(posed, size, views, up):
         yield draw(avatar, posed, camera, _background(capture), chunk)
@@ -131,8 +131,8 @@ def motion_frames(
         height = min(size, frame.camera.height)
         camera = camera or frame.camera.resized(height, round(frame.camera.width * height / frame.camera.height))
         posed = avatar.pose(frame.pose, frame.translation)
-        picture = draw(avatar, posed, camera, _background(capture), chunk)
-        yield np.concatenate([as_bytes(picture.color), as_bytes(picture.base)], 1)
+        image = draw(avatar, posed, camera, _background(capture), chunk)
+        yield np.concatenate([as_bytes(image.color), as_bytes(image.base)], 1)
 
 
 def render_run(
@@ -163,15 +163,15 @@ def render_run(
     background = _background(capture)
     shares = Shares(*_pieces(capture, what, size, views), show)
 
-    def counted(kind: str, pictures: Iterable[Item]) -> Iterator[Item]:
-        for picture in pictures:
+    def counted(kind: str, images: Iterable[Item]) -> Iterator[Item]:
+        for image in images:
             shares.done(kind)
-            yield picture
+            yield image
 
     if what in ("all", "canonical"):
         posed = pose_canonically(avatar)
         drawn = (draw(avatar, posed, camera, background, chunk) for camera in orbit(posed, size, 2))
-        parts = [panels(picture) for picture in counted("canonical", drawn)]
+        parts = [panels(image) for image in counted("canonical", drawn)]
         save_png(folder / "canonical.png", sheet([list(p.values()) for p in parts], ["front", "back"], list(parts[0])))
     for part, split in splits.items():
         if what in ("all", part) and capture.splits.get(split):
@@ -186,9 +186,9 @@ def render_run(
         posed = avatar.pose(frame.pose, frame.translation, frame.time)
 
         def turning() -> Iterator[np.ndarray]:
-            pictures = orbit_frames(avatar, posed, capture, size, views, scene_up(capture), chunk)
-            for view, picture in enumerate(counted("orbit", pictures)):
-                parts = panels(picture)
+            images = orbit_frames(avatar, posed, capture, size, views, scene_up(capture), chunk)
+            for view, image in enumerate(counted("orbit", images)):
+                parts = panels(image)
                 save_png(folder / "orbit" / f"{view:03d}.png", parts["full"])
                 yield np.concatenate([parts["full"], parts["normals"]], 1)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from twofold.geometry.cameras import Camera
 from twofold.metrics.image import to_8bit
 
-Picture: TypeAlias = Float[Tensor, "_ _ 3"] | Float[Tensor, "_ _"] | UInt8[np.ndarray, "_ _ 3"]
+SheetImage: TypeAlias = Float[Tensor, "_ _ 3"] | Float[Tensor, "_ _"] | UInt8[np.ndarray, "_ _ 3"]
 """Colours or shades in 0..1, or bytes as they are stored."""
 
 Font: TypeAlias = ImageFont.FreeTypeFont | ImageFont.ImageFont
@@ -20,7 +20,7 @@ PAPER, INK, FAINT = (255, 255, 255), (32, 34, 38), (112, 116, 124)
 
 
 def sheet(
-    rows: Sequence[Sequence[Picture | None]],
+    rows: Sequence[Sequence[SheetImage | None]],
     row_labels: Sequence[str] = (),
     column_labels: Sequence[str] = (),
     title: str = "",
@@ -40,8 +40,8 @@ def sheet(
     Raises:
         ValueError: there is no image, or the labels do not match the table.
     """
-    pictures = [[None if p is None else as_bytes(p) for p in row] for row in rows]
-    present = [p for row in pictures for p in row if p is not None]
+    images = [[None if p is None else as_bytes(p) for p in row] for row in rows]
+    present = [p for row in images for p in row if p is not None]
     columns = max((len(row) for row in rows), default=0)
     if not present:
         raise ValueError("a sheet needs at least one image")
@@ -49,7 +49,7 @@ def sheet(
         if labels and len(labels) != count:
             raise ValueError(f"the sheet has {count} {name}s, but {len(labels)} {name} labels came")
     tall = height or max(p.shape[0] for p in present)
-    cells = [[None if p is None else _scaled(p, tall) for p in row] for row in pictures]
+    cells = [[None if p is None else _scaled(p, tall) for p in row] for row in images]
 
     size = round(min(max(0.062 * tall, 13), 34))
     font, large, small = (ImageFont.load_default(s) for s in (size, 1.35 * size, 0.85 * size))
@@ -107,16 +107,16 @@ def residual_picture(
     return (0.5 + gain * (full - base)).clamp(0, 1)
 
 
-def as_bytes(picture: Picture) -> UInt8[np.ndarray, "h w 3"]:
+def as_bytes(image: SheetImage) -> UInt8[np.ndarray, "h w 3"]:
     """Any image as three bytes a pixel; shades become grey."""
-    if isinstance(picture, np.ndarray):
-        return picture
-    stored = to_8bit(picture).cpu().numpy()
+    if isinstance(image, np.ndarray):
+        return image
+    stored = to_8bit(image).cpu().numpy()
     return stored if stored.ndim == 3 else np.repeat(stored[..., None], 3, axis=-1)
 
 
-def _scaled(picture: np.ndarray, height: int) -> Image.Image:
-    image = Image.fromarray(picture)
+def _scaled(source: np.ndarray, height: int) -> Image.Image:
+    image = Image.fromarray(source)
     if image.height == height:
         return image
     width = max(round(image.width * height / image.height), 1)

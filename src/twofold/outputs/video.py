@@ -42,18 +42,18 @@ def write_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 3"]], 
     matrix = Colorspace.ITU709 if x264 else Colorspace.ITU601
     with write_atomically(path) as temporary, av.open(str(temporary), "w", options={"movflags": "faststart"}) as file:
         stream, size = None, (0, 0)
-        for picture in frames:
+        for image in frames:
             if stream is None:
-                size = picture.shape[:2]
+                size = image.shape[:2]
                 stream = file.add_stream("libx264" if x264 else "mpeg4", rate=Fraction(fps).limit_denominator(1001))
                 stream.height, stream.width = size[0] + size[0] % 2, size[1] + size[1] % 2
                 stream.pix_fmt = "yuv420p"
                 stream.options = {"crf": QUALITY} if x264 else {"qscale": "3"}
                 stream.codec_context.colorspace = matrix
                 stream.codec_context.thread_count = 1  # with more, the bytes depend on how many processors there are
-            if picture.shape[:2] != size:
-                raise ValueError(f"a frame of the video is {picture.shape[:2]}, the first was {size}")
-            padded = np.pad(picture, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
+            if image.shape[:2] != size:
+                raise ValueError(f"a frame of the video is {image.shape[:2]}, the first was {size}")
+            padded = np.pad(image, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
             frame = av.VideoFrame.from_ndarray(padded, format="rgb24")
             limited = frame.reformat(format="yuv420p", dst_colorspace=matrix, dst_color_range=ColorRange.MPEG)
             file.mux(stream.encode(limited))

@@ -15,7 +15,7 @@ from twofold.methods.base import Avatar, PosedAvatar, Rendering
 
 
 @dataclass(frozen=True)
-class Picture:
+class RenderedImage:
     """A rendered image; fields as in `Rendering`, as images. `residual` is the full colour minus the base one.
 
     Without a base branch, `base` and `base_normal` are those of the whole, and `base_opacity` is None.
@@ -52,7 +52,7 @@ def rays_at_once(device: torch.device) -> int:
 @torch.no_grad()
 def draw(
     avatar: Avatar, posed: PosedAvatar, camera: Camera, background: Float[Tensor, "3"], chunk: int | None = None
-) -> Picture:
+) -> RenderedImage:
     """Renders an image; rays that miss the body's surroundings are background without being followed.
 
     Args:
@@ -88,7 +88,7 @@ def draw(
             "lower learning rates."
         )
     color, opacity, depth, normal, bottom, bottom_normal, bottom_opacity = image.split([3, 1, 1, 3, 3, 3, 1], -1)
-    return Picture(
+    return RenderedImage(
         color.clamp(0, 1), opacity[..., 0], depth[..., 0], normal, bottom.clamp(0, 1), bottom_normal,
         bottom_opacity[..., 0] if has_base else None,
     )  # fmt: skip

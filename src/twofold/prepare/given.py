@@ -140,7 +140,7 @@ def chosen_landmarks(given: Given, seen: Track, sources: Sequence[int], place: P
     Args:
         given: with landmarks.
         seen: the estimator's.
-        sources: `Picture.source` of the images.
+        sources: `VideoFrame.source` of the images.
         place: where the landmarks come from, for the sentence.
     """
     tracks = [track_at(track, sources) for _, track in given.landmarks]

@@ -19,7 +19,7 @@ from torch import Tensor
 from twofold.body.retarget import convert_pose, straighten
 from twofold.body.skeleton import PARENTS, Body, pose_body, require_surface, shape_body
 from twofold.capture.folder import CaptureWriter
-from twofold.capture.layout import IMAGES, MASKS, PICTURE_ENDINGS, file_stem, spans
+from twofold.capture.layout import IMAGE_ENDINGS, IMAGES, MASKS, file_stem, spans
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.upright import turn_world
@@ -191,7 +191,7 @@ def _files(
 def _write_image(writer: CaptureWriter, time: int, file: Path, info: ClipInfo) -> None:
     header = read_header(file)
     plain = header.mode in ("RGB", "L") and not header.deep and header.upright
-    if plain and file.suffix.lower() in PICTURE_ENDINGS:
+    if plain and file.suffix.lower() in IMAGE_ENDINGS:
         writer.image_file(CAMERA, time, file)
     else:
         writer.image(CAMERA, time, read_picture(file, info))
@@ -201,7 +201,7 @@ def _as_stored(file: Path, values: MaskValues) -> bool:
     """Whether a mask file says what the capture's own do: 8 bits of grey, 255 on the person."""
     header = read_header(file)
     plain = header.mode in ("L", "1") and not header.deep and header.upright and not values.labels
-    return plain and file.suffix.lower() in PICTURE_ENDINGS
+    return plain and file.suffix.lower() in IMAGE_ENDINGS
 
 
 @contextlib.contextmanager

@@ -34,7 +34,7 @@ from twofold.prepare.given import Finder, Given, chosen_landmarks, chosen_masks,
 from twofold.prepare.output.acceptance import (
     FARTHER,
     STEADIER,
-    PictureQuality,
+    ImageQuality,
     kept_times,
     require_length,
     require_person,
@@ -62,7 +62,7 @@ class Prepared:
 
     folder: Path
     kept: tuple[int, ...]
-    qualities: tuple[PictureQuality, ...]
+    qualities: tuple[ImageQuality, ...]
     warnings: tuple[str, ...]
     objects: tuple[float, ...] = ()
 
@@ -79,10 +79,10 @@ class Prepared:
         """How much of the masks was taken for held objects."""
         if not self.objects:
             return ""
-        pictures = sum(quality.time in set(self.kept) for quality in self.qualities)
+        images = sum(quality.time in set(self.kept) for quality in self.qualities)
         return (
-            f" Held objects were taken out in {len(self.objects)} of {pictures} images, at most "
-            f"{100 * max(self.objects):.1f} % and on average {100 * sum(self.objects) / max(pictures, 1):.1f} % of the "
+            f" Held objects were taken out in {len(self.objects)} of {images} images, at most "
+            f"{100 * max(self.objects):.1f} % and on average {100 * sum(self.objects) / max(images, 1):.1f} % of the "
             "person's mask; the report of check shows them, --held-objects keep leaves them."
         )
 

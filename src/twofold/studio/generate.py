@@ -77,7 +77,7 @@ class StudioConfig:
                 raise TwofoldError(f"{name} of a studio capture should be 0 to 1, it is {getattr(self, name)}.")
 
 
-class Moment(NamedTuple):
+class PosedPerformer(NamedTuple):
     """The person in one frame: the true posed surface and the light on it."""
 
     vertices: Float[np.ndarray, "V 3"]
@@ -141,7 +141,7 @@ def _posed(shaped: ShapedBody, pose: Float[np.ndarray, "24 3"], translation: Flo
     return pose_body(shaped, torch.from_numpy(pose), torch.from_numpy(translation.astype(np.float32)))
 
 
-def perform(performer: Performer, time: int) -> Moment:
+def perform(performer: Performer, time: int) -> PosedPerformer:
     """The dressed person in one frame: wrinkled, posed and lit."""
     figure, pose = performer.figure, performer.poses[time]
     moved = displacement(performer.folds, pose.astype(np.float64), len(figure.vertices)).astype(np.float32)
@@ -150,7 +150,7 @@ def perform(performer: Performer, time: int) -> Moment:
     vertices = skin_sparsely(canonical, figure.weights, bones)
     normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(figure.faces)).numpy()
     key, sky = cast_shade(vertices, normals, performer.beads)
-    return Moment(vertices, normals, key, sky)
+    return PosedPerformer(vertices, normals, key, sky)
 
 
 def skin_sparsely(
@@ -165,7 +165,7 @@ def skin_sparsely(
 
 
 def photograph(
-    performer: Performer, moment: Moment, camera: Camera, samples: int
+    performer: Performer, moment: PosedPerformer, camera: Camera, samples: int
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """Colours over black and the share of each pixel that the person covers.
 
@@ -187,8 +187,8 @@ def photograph(
     material = paint(sample[:, :3], sample[:, 9:15].argmin(1), figure.anatomy, performer.look)
     color = illuminate(material, normals, to_camera, sample[:, 15], sample[:, 16])
     with_alpha = torch.from_numpy(np.concatenate([color, np.ones((len(color), 1), np.float32)], 1))
-    picture = box_filter(camera, samples, hits.pixel, with_alpha).numpy()
-    return picture[..., :3], picture[..., 3]
+    image = box_filter(camera, samples, hits.pixel, with_alpha).numpy()
+    return image[..., :3], image[..., 3]
 
 
 def make_studio(

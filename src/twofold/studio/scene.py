@@ -74,8 +74,8 @@ def room(camera: Camera, seed: int) -> Float[np.ndarray, "h w 3"]:
         art = np.where((np.sin(u * random.uniform(2, 9) + v * random.uniform(2, 9)) > 0)[..., None], color, other)
         paint = np.where((inside < 1)[..., None], np.where((inside > 0.88)[..., None], 0.15, art), paint)
     skirting = np.where((y < 0.12)[..., None], np.array([0.85, 0.84, 0.80]), paint)
-    picture = np.where(on_floor[..., None], wood, skirting).clip(0, 1)
-    return picture.reshape(camera.height, 2, camera.width, 2, 3).mean((1, 3)).astype(np.float32)
+    image = np.where(on_floor[..., None], wood, skirting).clip(0, 1)
+    return image.reshape(camera.height, 2, camera.width, 2, 3).mean((1, 3)).astype(np.float32)
 
 
 def degrade_mask(

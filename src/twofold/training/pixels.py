@@ -17,7 +17,7 @@ from twofold.recipe import PixelConfig
 
 
 @dataclass(frozen=True)
-class _Picture:
+class _TrainingImage:
     image: Tensor
     mask: Tensor
     subject: Tensor
@@ -66,19 +66,19 @@ class PixelSource:
         """
         self.frames, self.config, self.margin, self.box_margin = frames, config, margin, box_margin
         self._shaped = shape_body(body, betas)
-        self._pictures: dict[int, _Picture] = {}
+        self._images: dict[int, _TrainingImage] = {}
 
-    def picture(self, which: int) -> _Picture:
+    def image(self, which: int) -> _TrainingImage:
         """The frame's image and the pixels that may be drawn.
 
         Raises:
             TwofoldError: its mask shows nobody, or nobody who is not ignored.
         """
-        if which not in self._pictures:
-            self._pictures[which] = self._read(self.frames[which])
-        return self._pictures[which]
+        if which not in self._images:
+            self._images[which] = self._read(self.frames[which])
+        return self._images[which]
 
-    def _read(self, frame: Frame) -> _Picture:
+    def _read(self, frame: Frame) -> _TrainingImage:
         mask = frame.mask()
         image = frame.image()
         inside = mask > (0.5 if self.config.subject == "half" else 0)
@@ -108,7 +108,7 @@ class PixelSource:
                 f"{frame.ignored_file} ignores all of the person; leave the image out of the training frames."
             )
         subject &= reachable
-        return _Picture(
+        return _TrainingImage(
             (image * 255).round().to(torch.uint8),
             (mask * 255).round().to(torch.uint8),
             subject.flatten().nonzero()[:, 0].int(),
@@ -141,35 +141,35 @@ class PixelSource:
 
     def draw(self, which: int, generator: torch.Generator, device: torch.device | str = "cpu") -> Batch:
         """A batch from frame number `which`; the generator decides everything."""
-        picture, config = self.picture(which), self.config
-        height, width = picture.image.shape[:2]
+        original, config = self.image(which), self.config
+        height, width = original.image.shape[:2]
         near = round(config.rays * config.subject_share)
         chosen = [
             pool[self._choose(len(pool), count, generator)].long()
-            for pool, count in ((picture.subject, near), (picture.reachable, config.rays - near))
+            for pool, count in ((original.subject, near), (original.reachable, config.rays - near))
         ]
         patches = torch.full((config.patches, config.patch_size, config.patch_size), -1, dtype=torch.long)
         patch_image, patch_mask = torch.zeros(*patches.shape, 3), torch.zeros(patches.shape)
         used = config.rays
         reachable = torch.zeros(height * width, dtype=torch.bool)
-        reachable[picture.reachable.long()] = True
+        reachable[original.reachable.long()] = True
         for patch in range(config.patches):
-            window, within = self._window(picture, reachable, generator)
-            shown = within & picture.known.flatten()[window]
-            patch_image[patch].view(-1, 3)[shown] = picture.colors(window[shown])
-            patch_mask[patch].view(-1)[shown] = picture.coverage(window[shown])
+            window, within = self._window(original, reachable, generator)
+            shown = within & original.known.flatten()[window]
+            patch_image[patch].view(-1, 3)[shown] = original.colors(window[shown])
+            patch_mask[patch].view(-1)[shown] = original.coverage(window[shown])
             rays = (within & reachable[window]).nonzero()[:, 0]
             patches[patch].view(-1)[rays] = torch.arange(used, used + len(rays))
             chosen.append(window[rays])
             used += len(rays)
         index = torch.cat(chosen)
         position = torch.stack([index % width, index // width], -1).float()
-        image, mask = picture.colors(index), picture.coverage(index)
+        image, mask = original.colors(index), original.coverage(index)
         if config.between:
             moved = position[: config.rays] + torch.rand(config.rays, 2, generator=generator) - 0.5
             moved = moved.clamp_min(0).minimum(torch.tensor([width - 1.0, height - 1.0]))
             position = torch.cat([moved, position[config.rays :]])
-            between = picture.between(moved)
+            between = original.between(moved)
             image, mask = (
                 torch.cat([first, rest[config.rays :]]) for first, rest in zip(between, (image, mask), strict=True)
             )
@@ -191,13 +191,13 @@ class PixelSource:
             return torch.randint(pool, (count,), generator=generator)
         return torch.randperm(pool, generator=generator)[:count]
 
-    def _window(self, picture: _Picture, reachable: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def _window(self, image: _TrainingImage, reachable: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Flat pixels of one patch row by row, and which of them lie in the image."""
         size = self.config.patch_size
-        height, width = picture.image.shape[:2]
+        height, width = image.image.shape[:2]
         on_subject = bool(torch.rand((), generator=generator) < self.config.patch_on_subject)
-        outside = reachable & ~picture.inside.flatten()
-        pool = (picture.inside.flatten() if on_subject or not outside.any() else outside).nonzero()[:, 0]
+        outside = reachable & ~image.inside.flatten()
+        pool = (image.inside.flatten() if on_subject or not outside.any() else outside).nonzero()[:, 0]
         center = int(pool[torch.randint(len(pool), (), generator=generator)])
         top = min(max(center // width - size // 2, 0), max(height - size, 0))
         left = min(max(center % width - size // 2, 0), max(width - size, 0))

@@ -68,7 +68,7 @@ def test_two_clips_of_one_name_are_refused():
         match_cameras(named("cam1", "cam2"), ["cam1", "cam1"])
 
 
-def picture(height, width, bars=(0, 0), seed=0):
+def image(height, width, bars=(0, 0), seed=0):
     pixels = np.random.default_rng(seed).integers(60, 200, (height, width, 3)).astype(np.uint8)
     top, left = bars
     pixels[:top] = pixels[height - top :] = 3
@@ -77,14 +77,14 @@ def picture(height, width, bars=(0, 0), seed=0):
 
 
 def test_images_of_the_calibrated_size_change_nothing():
-    assert for_pictures(camera(), picture(1280, 720)) is not None
-    assert for_pictures(view := camera(), picture(1280, 720)) is view
+    assert for_pictures(camera(), image(1280, 720)) is not None
+    assert for_pictures(view := camera(), image(1280, 720)) is view
 
 
 @given(st.sampled_from([(640, 360), (1920, 1080), (427, 240), (1279, 720)]))
 def test_scaled_images_show_the_same_in_another_size(size):
     height, width = size
-    view = for_pictures(camera(), picture(height, width))
+    view = for_pictures(camera(), image(height, width))
     assert (view.height, view.width) == size
     # Fractions of the image stay, counted from its edge at -0.5.
     expected = (projected(camera(), POINTS) + 0.5) / [720, 1280] * [width, height] - 0.5
@@ -93,10 +93,10 @@ def test_scaled_images_show_the_same_in_another_size(size):
 
 def test_black_bars_are_seen():
     # 720 x 1280 shrunk to 700 columns leaves 1244.4 rows, so bars of 17.8 above and below.
-    view = for_pictures(camera(), picture(1280, 700, bars=(17, 0)))
+    view = for_pictures(camera(), image(1280, 700, bars=(17, 0)))
     expected = (projected(camera(), POINTS) + 0.5) * 700 / 720 + [0, (1280 - 1280 * 700 / 720) / 2] - 0.5
     assert np.abs(projected(view, POINTS) - expected).max() < 1e-9
-    wide = for_pictures(camera(), picture(720, 1280, bars=(0, 437)))
+    wide = for_pictures(camera(), image(720, 1280, bars=(0, 437)))
     expected = (projected(camera(), POINTS) + 0.5) * 720 / 1280 + [437.5, 0] - 0.5
     assert np.abs(projected(wide, POINTS) - expected).max() < 1e-9
 
@@ -108,7 +108,7 @@ def test_dark_images_are_not_taken_for_bars():
 
 def test_what_coders_cut_off_lies_right_and_below():
     for height, width in [(1280, 712), (1272, 720), (1288, 720)]:
-        view = for_pictures(camera(), picture(height, width))
+        view = for_pictures(camera(), image(height, width))
         assert np.array_equal(view.intrinsics, camera().intrinsics)
         assert (view.height, view.width) == (height, width)
 
@@ -123,21 +123,21 @@ def test_what_coders_cut_off_lies_right_and_below():
 )
 def test_sizes_that_do_not_go_together_are_refused(size, sentence):
     with pytest.raises(TwofoldError, match=sentence):
-        for_pictures(camera(), picture(*size))
+        for_pictures(camera(), image(*size))
 
 
 def test_calibration_without_a_size_takes_the_videos():
-    view = for_pictures(replace(camera(), height=None, width=None), picture(1280, 720))
+    view = for_pictures(replace(camera(), height=None, width=None), image(1280, 720))
     assert (view.height, view.width) == (1280, 720)
     for width, height in ((2160, 3840), (540, 960), (1080, 1920)):
         with pytest.raises(TwofoldError, match=f"the middle of images of about 720x1280, and the video has {width}x"):
-            for_pictures(replace(camera(), height=None, width=None), picture(height, width))
+            for_pictures(replace(camera(), height=None, width=None), image(height, width))
 
 
 @pytest.mark.parametrize(("height", "width"), [(640, 368), (848, 480), (1920, 1088)])
 def test_a_side_that_an_encoder_rounded_has_its_own_scale(height, width):
     """720 x 1280 scaled to 360 x 640, 477 x 848 and 1080 x 1920, whose shorter sides became multiples of 16."""
-    view = for_pictures(camera(), picture(height, width))
+    view = for_pictures(camera(), image(height, width))
     assert (view.height, view.width) == (height, width)
     across, down = width / 720, height / 1280
     assert view.intrinsics[0, 0] == pytest.approx(across * camera().intrinsics[0, 0])

@@ -52,12 +52,12 @@ def pretended(monkeypatch):
     return made
 
 
-def picture(height=20, width=66):
+def image(height=20, width=66):
     return np.zeros((height, width, 3), np.uint8)
 
 
 def test_shares_of_the_image_become_pixels(pretended):
-    found = mediapipe_estimator()(picture(), 0.0)
+    found = mediapipe_estimator()(image(), 0.0)
     # The middle of an image of 66 columns is between columns 32 and 33.
     assert np.allclose(found.pixels[:, 0], np.arange(33) / 33 * 66 - 0.5, atol=1e-4)
     assert np.allclose(found.pixels[:, 1], (1 - np.arange(33) / 33) * 20 - 0.5, atol=1e-4)
@@ -70,9 +70,9 @@ def test_shares_of_the_image_become_pixels(pretended):
 
 def test_nobody(pretended):
     estimator = mediapipe_estimator()
-    estimator(picture(), 0.0)
+    estimator(image(), 0.0)
     pretended[0].found = False
-    found = estimator(picture(), 0.1)
+    found = estimator(image(), 0.1)
     assert np.isnan(found.pixels).all()
     assert np.isnan(found.world).all()
     assert not found.visibility.any()
@@ -83,17 +83,17 @@ def test_nobody(pretended):
 
 def test_it_is_silenced_until_somebody_was_found(pretended, capfd):
     estimator = mediapipe_estimator()
-    estimator(picture(), 0.0)
+    estimator(image(), 0.0)
     pretended[0].found = False
     assert capfd.readouterr().err == ""
-    estimator(picture(), 0.1)
+    estimator(image(), 0.1)
     assert capfd.readouterr().err == "sought"
 
 
 def test_its_clock_follows_the_clip(pretended):
     estimator = mediapipe_estimator()
     for seconds in (0.0, 0.5, 0.5, 0.4, 2.0):
-        estimator(picture()[:, ::-1], seconds)
+        estimator(image()[:, ::-1], seconds)
     times = np.array(pretended[0].times)
     assert np.all(np.diff(times) > 0)
     assert times[1] - times[0] == 500_000
@@ -102,7 +102,7 @@ def test_its_clock_follows_the_clip(pretended):
 
 def test_masks_are_left_out_on_demand(pretended):
     estimator = mediapipe_estimator(masks=False)
-    assert not estimator(picture(), 0.0).mask.any()
+    assert not estimator(image(), 0.0).mask.any()
     assert pretended[0].options["enable_segmentation"] is False
     estimator.close()
     estimator.close()

@@ -17,20 +17,20 @@ def place_of(name: str) -> tuple[float, float]:
     return 20.0 + 15 * LANDMARKS.index(name), 400.0 - 10 * LANDMARKS.index(name)
 
 
-def seen_in(layout: int, pictures: int = 6) -> np.ndarray:
+def seen_in(layout: int, images: int = 6) -> np.ndarray:
     """Landmarks in a layout; image t is moved by t pixels to the right."""
-    values = np.full((pictures, layout, 3), 7.0)
+    values = np.full((images, layout, 3), 7.0)
     for index, name in enumerate(LAYOUTS[layout]):
         if name:
             values[:, index] = [*place_of(name), 0.8]
-    values[..., 0] += np.arange(pictures)[:, None]
+    values[..., 0] += np.arange(images)[:, None]
     return values
 
 
-def check(track, layout, pictures=6):
+def check(track, layout, images=6):
     known = [name in LAYOUTS[layout] for name in LANDMARKS]
     wanted = np.array([place_of(name) for name in LANDMARKS])
-    for time in range(pictures):
+    for time in range(images):
         assert np.allclose(track.pixels[time, known], (wanted + np.array([time, 0]))[known], atol=1e-3)
     assert np.all(np.isnan(track.pixels[:, ~np.array(known)]))
     assert np.all(track.visibility == np.where(known, np.float32(0.8), 0))

@@ -83,7 +83,7 @@ def test_masks_follow_images_that_are_left_out_and_shrunk(tmp_path):
     clip = write_clip(tmp_path / "clip.mp4", [grey(5 * i, 96, 128) for i in range(20)], fps=20)
     frames = Frames(clip, fps=5, max_size=64)
     masks = masks_from_folder(write_masks(tmp_path / "masks", [f"{i}.png" for i in range(20)], 96, 128), frames.info)
-    found = [masks(picture.source) for picture in frames]
+    found = [masks(image.source) for image in frames]
     assert {mask.shape for mask in found} == {(48, 64)}
     assert [mask[:, 0].astype(float).sum() / 255 for mask in found] == pytest.approx([0.5, 2.5, 4.5, 6.5, 8.5], abs=0.1)
 

@@ -19,7 +19,7 @@ SINGLE = [
 
 
 @functools.cache
-def pictures(name, count=5, rows=480):
+def images(name, count=5, rows=480):
     frames = [p.image for p in Frames(real_clip(name), fps=6 if "cam" in name else 1)]
     chosen = [frames[round(i)] for i in np.linspace(0, len(frames) - 1, count)]
     return [resized(image, rows) for image in chosen]
@@ -44,7 +44,7 @@ def person(column, row=100.0, size=50.0, score=0.9):
 @pytest.mark.parametrize("name", SINGLE)
 def test_one_person_and_those_far_behind_are_one(name):
     pytest.importorskip("mediapipe")
-    people = count_people(pictures(name))
+    people = count_people(images(name))
     assert people.counts == (1,) * 5
     assert not people.too_many
 
@@ -52,7 +52,7 @@ def test_one_person_and_those_far_behind_are_one(name):
 @pytest.mark.parametrize(("left", "right"), [(0, 1), (1, 3)])
 def test_two_people_side_by_side_are_too_many(left, right):
     pytest.importorskip("mediapipe")
-    pairs = zip(pictures(SINGLE[left]), pictures(SINGLE[right]), strict=True)
+    pairs = zip(images(SINGLE[left]), images(SINGLE[right]), strict=True)
     people = count_people(beside(a, b) for a, b in pairs)
     assert people.several >= 0.8
     assert people.too_many
@@ -60,12 +60,12 @@ def test_two_people_side_by_side_are_too_many(left, right):
 
 def test_a_person_beside_the_mirror_image_is_too_many():
     pytest.importorskip("mediapipe")
-    assert count_people(np.concatenate([p, p[:, ::-1]], 1) for p in pictures(SINGLE[4])).several == 1
+    assert count_people(np.concatenate([p, p[:, ::-1]], 1) for p in images(SINGLE[4])).several == 1
 
 
 def test_somebody_half_as_large_does_no_harm():
     pytest.importorskip("mediapipe")
-    pairs = zip(pictures(SINGLE[0]), pictures(SINGLE[2]), strict=True)
+    pairs = zip(images(SINGLE[0]), images(SINGLE[2]), strict=True)
     assert not count_people(beside(a, b, 0.5) for a, b in pairs).too_many
 
 

@@ -13,7 +13,7 @@ from scipy import ndimage
 from twofold.errors import TwofoldError
 from twofold.prepare.detect.scan import clean_mask, spread_out, watch_clip
 from twofold.prepare.detections import Observation, nobody
-from twofold.prepare.video.frames import Picture
+from twofold.prepare.video.frames import VideoFrame
 
 HEIGHT, WIDTH = 60, 80
 
@@ -115,7 +115,7 @@ def wall(seed=0):
     return (128 + 50 * noise / noise.std()).clip(0, 255).astype(np.uint8)
 
 
-def pictures(count, step=0, alive=None, every=1):
+def clip_frames(count, step=0, alive=None, every=1):
     """A wall seen by a camera that moves sideways by `step` pixels an image."""
     background = wall()
     for k in range(count):
@@ -124,20 +124,20 @@ def pictures(count, step=0, alive=None, every=1):
         if alive is not None:
             alive.append(weakref.ref(image))
         image[0, k % WIDTH] = k  # No two are equal
-        yield Picture(k, k / 10, image, every * k, k)
+        yield VideoFrame(k, k / 10, image, every * k, k)
 
 
 def test_images_masks_and_landmarks_are_put_aside(tmp_path):
     finder, told = Finder(), []
-    given = list(pictures(6, every=3))
+    given = list(clip_frames(6, every=3))
     seen = watch_clip(iter(given), 6, finder, tmp_path / "a" / "b", show=told.append)
     assert len(seen.images) == len(seen.masks) == len(seen.track) == 6
     assert seen.sources == (0, 3, 6, 9, 12, 15)
     assert told == pytest.approx([(k + 1) / 6 for k in range(6)])
     assert [second for *_, second in finder.shown] == pytest.approx([k / 10 for k in range(6)])
-    for k, (picture, image, mask) in enumerate(zip(given, seen.images, seen.masks, strict=True)):
+    for k, (original, image, mask) in enumerate(zip(given, seen.images, seen.masks, strict=True)):
         with Image.open(image) as stored:
-            assert np.abs(np.asarray(stored).astype(int) - picture.image).mean() < 2
+            assert np.abs(np.asarray(stored).astype(int) - original.image).mean() < 2
         with Image.open(mask) as stored:
             expected = disc(21 + k) if k != 2 else np.zeros((HEIGHT, WIDTH), np.uint8)
             assert np.array_equal(np.asarray(stored), expected)
@@ -151,9 +151,9 @@ def test_images_masks_and_landmarks_are_put_aside(tmp_path):
 
 def test_images_are_undistorted_before_anybody_looks(tmp_path):
     finder = Finder()
-    seen = watch_clip(pictures(3), 3, finder, tmp_path, undistort=lambda image: image // 2)
+    seen = watch_clip(clip_frames(3), 3, finder, tmp_path, undistort=lambda image: image // 2)
     plain = Finder()
-    watch_clip(pictures(3), 3, plain, tmp_path / "plain")
+    watch_clip(clip_frames(3), 3, plain, tmp_path / "plain")
     for (dark, *_), (bright, *_) in zip(finder.shown, plain.shown, strict=True):
         assert dark == pytest.approx(bright / 2, abs=1)
     with Image.open(seen.images[0]) as stored:
@@ -167,13 +167,13 @@ def test_own_masks_are_taken_as_they_are(tmp_path):
     def given(source):
         return own if source == 4 else None
 
-    seen = watch_clip(pictures(3, every=4), 3, Finder(), tmp_path, given=[given])
+    seen = watch_clip(clip_frames(3, every=4), 3, Finder(), tmp_path, given=[given])
     stored = [np.asarray(Image.open(path)) for path in seen.masks]
     assert np.array_equal(stored[1], own)
     assert np.array_equal(stored[0], disc(21))
-    seen = watch_clip(pictures(3, every=4), 3, Finder(), tmp_path, lambda image: np.roll(image, 3, 1), [given])
-    with Image.open(seen.masks[1]) as picture:
-        assert np.array_equal(np.asarray(picture), np.roll(own, 3, 1))
+    seen = watch_clip(clip_frames(3, every=4), 3, Finder(), tmp_path, lambda image: np.roll(image, 3, 1), [given])
+    with Image.open(seen.masks[1]) as original:
+        assert np.array_equal(np.asarray(original), np.roll(own, 3, 1))
 
 
 def test_memory_holds_a_few_images_only(tmp_path):
@@ -182,7 +182,7 @@ def test_memory_holds_a_few_images_only(tmp_path):
     def count(done):
         most.append(sum(image() is not None for image in alive) + sum(mask() is not None for mask in finder.masks))
 
-    seen = watch_clip(pictures(60, alive=alive), 60, finder, tmp_path, show=count)
+    seen = watch_clip(clip_frames(60, alive=alive), 60, finder, tmp_path, show=count)
     assert len(seen.sample) == 12
     # The sample, and the image at hand with its mask.
     assert max(most) <= 12 + 4
@@ -192,20 +192,20 @@ def test_memory_holds_a_few_images_only(tmp_path):
 
 @pytest.mark.parametrize(("step", "least", "most"), [(0, 0.0, 0.5), (1, 10.0, 25.0)])
 def test_a_camera_that_moves_is_noticed(tmp_path, step, least, most):
-    seen = watch_clip(pictures(24, step), 24, Finder(), tmp_path)
+    seen = watch_clip(clip_frames(24, step), 24, Finder(), tmp_path)
     assert least <= seen.moved <= most
 
 
 def test_a_clip_of_unknown_length_is_gone_through(tmp_path):
     told = []
-    seen = watch_clip(pictures(5), 2, Finder(), tmp_path, show=told.append)
+    seen = watch_clip(clip_frames(5), 2, Finder(), tmp_path, show=told.append)
     assert len(seen.images) == 5
     assert told[-1] == 1
 
 
 def test_a_full_disk_is_said_in_one_sentence(tmp_path):
     with files_end_at(500), pytest.raises(TwofoldError, match=r"^Cannot write .*: .*\.$"):
-        watch_clip(pictures(3), 3, Finder(), tmp_path / "scratch")
+        watch_clip(clip_frames(3), 3, Finder(), tmp_path / "scratch")
 
 
 @given(count=st.integers(0, 300), most=st.integers(1, 50))

@@ -16,12 +16,12 @@ from twofold.geometry.cameras import Camera
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from twofold.prepare.detections import LANDMARKS, Track
 from twofold.prepare.output.acceptance import (
-    LEAST_PICTURES,
     LEAST_VISIBILITY,
+    MIN_IMAGES,
     MOST_REPROJECTION,
-    PictureQuality,
+    ImageQuality,
+    image_quality,
     kept_times,
-    picture_quality,
     require_length,
     require_person,
     require_whole,
@@ -31,14 +31,14 @@ from twofold.prepare.silhouettes import LEAST_IOU
 from twofold.prepare.turning import arc, camera_directions
 
 CAMERA = standing_camera()
-GOOD = PictureQuality("cam", 0, 0.9, 1.0, 1.0, 0.9, False)
+GOOD = ImageQuality("cam", 0, 0.9, 1.0, 1.0, 0.9, False)
 
 
 def judged(iou=0.9, error=1.0, visibility=0.9, height=150.0, alone=True, **changes):
     """The record of an image whose landmarks are all `error` pixels off."""
     shown = np.random.default_rng(0).uniform(20, 140, (33, 2))
     arrays = {"pixels": shown + np.array([0.6, 0.8]) * error, "visibility": np.full(33, visibility)} | changes
-    return picture_quality("cam", CAMERA, 7, iou, shown, height=height, alone=alone, **arrays)
+    return image_quality("cam", CAMERA, 7, iou, shown, height=height, alone=alone, **arrays)
 
 
 def test_a_good_image_has_no_fault():
@@ -78,7 +78,7 @@ def test_only_landmarks_that_are_seen_are_measured():
     pixels, visibility = shown + np.array([3.0, 4.0]), np.full(33, 0.9)
     visibility[:5], pixels[:5] = 0.4, 1000
     pixels[5:9] = np.nan
-    quality = picture_quality("cam", CAMERA, 0, 0.9, shown, pixels, visibility, 100.0)
+    quality = image_quality("cam", CAMERA, 0, 0.9, shown, pixels, visibility, 100.0)
     assert quality.reprojection == pytest.approx(5)
 
 
@@ -104,7 +104,7 @@ def test_ends_beyond_the_edge_make_an_image_cropped(name, place, cropped):
 
 
 def test_short_clips_are_refused():
-    require_length(LEAST_PICTURES, "a.mp4")
+    require_length(MIN_IMAGES, "a.mp4")
     with pytest.raises(TwofoldError, match=r"a.mp4 has 3 images, expected at least 12"):
         require_length(3, "a.mp4")
 

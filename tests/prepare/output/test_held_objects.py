@@ -134,9 +134,9 @@ def test_folds_shading_edges_and_a_fit_that_is_off_are_no_objects() -> None:
     image, seen, usual = _striped()
     rows = np.arange(200)[:, None, None]
     shaded = image * (1 + 0.4 * np.sin(rows / 5)) * np.linspace(1.3, 0.6, 200)[None, :, None]
-    for picture in (image, shaded.clip(0, 1), np.roll(image, 3, axis=1), np.roll(image, -2, axis=0)):
+    for original in (image, shaded.clip(0, 1), np.roll(image, 3, axis=1), np.roll(image, -2, axis=0)):
         mask = np.roll(_person(), 3, axis=1) | _person()
-        assert not _hidden(picture, mask, seen, usual)[1].any()
+        assert not _hidden(original, mask, seen, usual)[1].any()
 
 
 def test_thin_things_are_no_objects_and_where_nothing_is_known_nothing_is_found() -> None:

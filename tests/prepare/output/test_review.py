@@ -26,15 +26,15 @@ def filmed(folder, motion=None, balls=()):
     folder.mkdir(exist_ok=True)
     for time, mask in enumerate(silhouettes(body, motion, CAMERA)):
         image = np.where(mask[..., None] > 0, np.uint8(SHIRT), np.uint8(WALL)).astype(np.uint8)
-        picture, outline = Image.fromarray(image), Image.fromarray(mask)
+        original, outline = Image.fromarray(image), Image.fromarray(mask)
         for when, (column, row, radius) in balls:
             if when == time:
                 box = (column - radius, row - radius, column + radius, row + radius)
-                ImageDraw.Draw(picture).ellipse(box, fill=BALL)
+                ImageDraw.Draw(original).ellipse(box, fill=BALL)
                 ImageDraw.Draw(outline).ellipse(box, fill=255)
         images.append(folder / f"{time}.jpg")
         masks.append(folder / f"{time}.png")
-        picture.save(images[-1], quality=95, subsampling=0)
+        original.save(images[-1], quality=95, subsampling=0)
         outline.save(masks[-1])
     track = landmarks(body, motion, CAMERA)
     times = tuple(range(MOMENTS))
@@ -49,8 +49,8 @@ def compared(watched, motion=None, held="remove", alone=True, size=150.0, show=l
 
 
 def read(path):
-    with Image.open(path) as picture:
-        return np.asarray(picture)
+    with Image.open(path) as image:
+        return np.asarray(image)
 
 
 def test_the_truth_agrees(tmp_path):

@@ -198,8 +198,8 @@ def test_calibrations_of_other_clips_are_refused(tmp_path):
 
 def test_videos_of_several_rates_are_refused_unless_one_is_given(tmp_path):
     calibration = a_calibration(tmp_path, [replace(small_camera(n), height=64, width=96) for n in ("left", "right")])
-    pictures = [grey(k, 64, 96) for k in range(12)]
-    clips = [write_clip(tmp_path / f"{n}.mp4", pictures, fps) for n, fps in (("left", 20), ("right", 25))]
+    images = [grey(k, 64, 96) for k in range(12)]
+    clips = [write_clip(tmp_path / f"{n}.mp4", images, fps) for n, fps in (("left", 20), ("right", 25))]
     with pytest.raises(TwofoldError, match=r"different frame rates \(left 20, right 25\).*--fps"):
         open_clips(clips, replace(PLAIN, calibration=calibration))
     ready = open_clips(clips, replace(PLAIN, calibration=calibration, fps=10.0))

@@ -20,7 +20,7 @@ from twofold.prepare.video.frames import Frames, describe, natural_order, neares
 
 def levels(frames) -> list[int]:
     """The grey of each image."""
-    return [round(float(picture.image.mean())) for picture in frames]
+    return [round(float(image.image.mean())) for image in frames]
 
 
 def looks_like(found, wanted, tolerance=40) -> bool:
@@ -39,11 +39,11 @@ def test_a_phones_video_comes_out_upright(tmp_path, matrix, quarters):
     path = hold_phone(write_clip(tmp_path / "phone.mp4", [stored] * 3), matrix)
 
     frames = Frames(path)
-    pictures = list(frames)
+    images = list(frames)
 
     assert (frames.info.height, frames.info.width) == meant.shape[:2]
-    assert len(pictures) == 3
-    assert all(looks_like(p.image, meant) for p in pictures)
+    assert len(images) == 3
+    assert all(looks_like(p.image, meant) for p in images)
     assert frames.remarks == ()
 
 
@@ -170,9 +170,9 @@ def test_the_longer_side_is_limited_by_averaging(tmp_path, kind):
         frames = Frames(write_clip(tmp_path / "fine.mp4", [fine] * 2), max_size=96)
     info = frames.info
     assert (info.width, info.height, info.full_width, info.full_height) == (96, 64, 384, 256)
-    for picture in frames:
-        assert picture.image.shape == (64, 96, 3)
-        assert np.all(np.abs(picture.image.astype(int) - 127) < 12)
+    for image in frames:
+        assert image.image.shape == (64, 96, 3)
+        assert np.all(np.abs(image.image.astype(int) - 127) < 12)
 
 
 def test_sizes_are_never_raised():
@@ -217,7 +217,7 @@ def test_images_of_more_than_8_bits_are_as_bright_as_they_were(tmp_path, kind, w
         stored = values.astype(np.float32) if white in (1.0, 255.0) else values.round().astype(np.uint16)
         Image.fromarray(stored).save(tmp_path / f"{number}.tiff")
     frames = Frames(tmp_path)
-    first, second = (picture.image.astype(int) for picture in frames)
+    first, second = (image.image.astype(int) for image in frames)
     assert np.abs(first - meant[..., None]).max() <= 1
     assert np.abs(second - (meant // 8)[..., None]).max() <= 1
     assert ("is taken as white" in " ".join(frames.remarks)) == (white not in (65535, 1.0))
@@ -257,8 +257,8 @@ def cut(path, share):
 
 def test_what_there_is_of_a_cut_file_is_used(tmp_path):
     rng = np.random.default_rng(0)
-    pictures = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(50)]
-    frames = Frames(cut(write_clip(tmp_path / "cut.mp4", pictures, first_to_last=True), 0.6))
+    images = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(50)]
+    frames = Frames(cut(write_clip(tmp_path / "cut.mp4", images, first_to_last=True), 0.6))
     found = list(frames)
     assert 15 < len(found) < 40
     assert [p.index for p in found] == list(range(len(found)))

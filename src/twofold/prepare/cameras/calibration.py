@@ -88,22 +88,22 @@ def match_cameras(cameras: Mapping[str, CalibratedCamera], clips: Sequence[str])
     )
 
 
-def for_pictures(camera: CalibratedCamera, picture: UInt8[np.ndarray, "h w 3"]) -> CalibratedCamera:
+def for_pictures(camera: CalibratedCamera, image: UInt8[np.ndarray, "h w 3"]) -> CalibratedCamera:
     """The camera of a clip whose images were cut or resized after the calibration.
 
     In this order: the same size; the same shape, so scaled; scaled with black bars on both sides, which must be seen
-    in `picture`; a few columns or rows less or more, so cut or padded on the right or below, as video coders do; scaled
+    in `image`; a few columns or rows less or more, so cut or padded on the right or below, as video coders do; scaled
     and one side rounded to a multiple of 8 or 16, as video coders do too, so that both sides have their own scale.
     Where the calibration does not say its size, the principal point must be near the middle of the image.
 
     Args:
         camera: as calibrated.
-        picture: any one of the clip as decoded (8-bit sRGB), upright.
+        image: any one of the clip as decoded (8-bit sRGB), upright.
 
     Raises:
         TwofoldError: the sizes do not go together.
     """
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     if camera.height is None or camera.width is None:
         cx, cy = camera.intrinsics[:2, 2].tolist()
         meant = size_of_principal_point(cx, cy, height, width)
@@ -121,7 +121,7 @@ def for_pictures(camera: CalibratedCamera, picture: UInt8[np.ndarray, "h w 3"]) 
         return _resized(camera, height, width, (across, down), (0.0, 0.0))
     scale = min(across, down)
     left, top = (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
-    if _has_bars(picture, round(top), round(left)):
+    if _has_bars(image, round(top), round(left)):
         return _resized(camera, height, width, (scale, scale), (left, top))
     if max(abs(width - camera.width), abs(height - camera.height)) <= min(_CROPPED, 0.02 * max(height, width)):
         return replace(camera, height=height, width=width)
@@ -204,8 +204,8 @@ def undistorter(
     across, down = 2 * source[..., 0] / max(width - 1, 1) - 1, 2 * source[..., 1] / max(height - 1, 1) - 1
     where = torch.as_tensor(np.stack([across, down], -1)[None].astype(np.float32))
 
-    def undistort(picture: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
-        planes = torch.as_tensor(picture.astype(np.float32)).permute(2, 0, 1)[None]
+    def undistort(image: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
+        planes = torch.as_tensor(image.astype(np.float32)).permute(2, 0, 1)[None]
         moved = torch.nn.functional.grid_sample(planes, where, padding_mode="border", align_corners=True)
         return moved[0].permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).numpy()
 
@@ -239,11 +239,11 @@ def _resized(
     return replace(camera, intrinsics=intrinsics, height=height, width=width)
 
 
-def _has_bars(picture: UInt8[np.ndarray, "h w 3"], top: int, left: int) -> bool:
+def _has_bars(image: UInt8[np.ndarray, "h w 3"], top: int, left: int) -> bool:
     """Whether both sides are black for `top` rows or `left` columns (the other is 0), but not for much more."""
     if top < 2 and left < 2:
         return False
-    lines = picture if top >= 2 else picture.swapaxes(0, 1)
+    lines = image if top >= 2 else image.swapaxes(0, 1)
     bar = max(top, left)
     dark: Bool[np.ndarray, "n"] = np.percentile(lines.reshape(len(lines), -1), 90, axis=1) < 24
     outer = np.concatenate([dark[: bar - 1], dark[len(dark) - bar + 1 :]])

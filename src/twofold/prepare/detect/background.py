@@ -84,7 +84,7 @@ def _details(grey: Float[np.ndarray, "a b"], beside: Bool[np.ndarray, "a b"]) ->
 
 
 def shift_between(first: Surroundings, other: Surroundings) -> tuple[int, int] | None:
-    """How far the second background lies from the first (down, right), small pixels; None where it cannot be told.
+    """How far the second background lies from the first (down, right), small pixels; None where it is unknown.
 
     Masked phase correlation (Padfield 2012) proposes a shift. It counts where the backgrounds correlate by `ALIKE` then
     and the residual is less than `BETTER` of what no shift leaves; no motion counts where they correlate without one.

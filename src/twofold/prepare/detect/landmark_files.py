@@ -48,7 +48,7 @@ def landmarks_from_file(path: Path | str, info: ClipInfo) -> Track:
 
 
 def landmark_readings(path: Path | str, info: ClipInfo) -> list[tuple[str, Track]]:
-    """Landmarks of every image of a clip as it is before any are left out (`Picture.source`), scaled as they are.
+    """Landmarks of every image of a clip as it is before any are left out (`VideoFrame.source`), scaled as they are.
 
     World landmarks are NaN. What is missing is NaN with visibility 0; so are images without landmarks.
 
@@ -104,7 +104,7 @@ def track_at(track: Track, sources: Sequence[int]) -> Track:
 
     Args:
         track: of all images.
-        sources: `Picture.source` of those wanted.
+        sources: `VideoFrame.source` of those wanted.
     """
     places = np.array(sources, int)
     inside = places < len(track)

@@ -23,7 +23,7 @@ class GivenMasks:
 
     Attributes:
         folder: where they lie.
-        numbering: which file belongs to which `Picture.source`.
+        numbering: which file belongs to which `VideoFrame.source`.
         others: other ways to read the files' numbers, which the images have to decide between.
         width: columns of what comes out.
         height: rows of what comes out.

@@ -19,7 +19,7 @@ from twofold.prepare.detect.background import Surroundings, background_motion, s
 from twofold.prepare.detect.person import Region, around_mask, only
 from twofold.prepare.detections import Estimator, Observation, Track, track_of
 from twofold.prepare.silhouettes import overlap
-from twofold.prepare.video.frames import Picture
+from twofold.prepare.video.frames import VideoFrame
 
 _SAMPLES, _VIEWS = 12, 40
 """Images that are kept to count people, and backgrounds that are compared."""
@@ -41,8 +41,8 @@ class Watched:
         track: landmarks.
         sources: which image of the clip itself each one is; none comes twice.
         seconds: when each was taken.
-        steps: the even step of time that each stands for (`Picture.step`).
-        moved: how far the background moves at most, pixels; None where that cannot be told.
+        steps: the even step of time that each stands for (`VideoFrame.step`).
+        moved: how far the background moves at most, pixels; None where that is unknown.
         sample: some images spread over the clip.
         repeated: images that show the same as the one before, and are left out.
         overlaps: of each reading of the user's own masks the IoU with the estimator's, NaN where one is missing; empty
@@ -69,7 +69,7 @@ class Watched:
 
 
 def watch_clip(
-    pictures: Iterable[Picture],
+    frames: Iterable[VideoFrame],
     expected: int,
     estimator: Estimator,
     scratch: Path,
@@ -81,7 +81,7 @@ def watch_clip(
     """Looks at every image of a clip. One that equals the one before it, as stretched videos have them, is left out.
 
     Args:
-        pictures: in order.
+        frames: in order.
         expected: about how many there are.
         estimator: finds the person.
         scratch: folder for the files.
@@ -107,19 +107,19 @@ def watch_clip(
     repeated = 0
     with plain_errors(scratch):
         scratch.mkdir(parents=True, exist_ok=True)
-    for picture in pictures:
-        if before is not None and np.array_equal(before, picture.image):
+    for frame in frames:
+        if before is not None and np.array_equal(before, frame.image):
             repeated += 1
             continue
-        before = picture.image
-        image = picture.image if undistort is None else undistort(picture.image)
-        own = [_straight(reading(picture.source), undistort) for reading in given]
+        before = frame.image
+        image = frame.image if undistort is None else undistort(frame.image)
+        own = [_straight(reading(frame.source), undistort) for reading in given]
         drawn = [mask for mask in own if mask is not None]
         if region is not None:
-            around = region(image, picture.source)
+            around = region(image, frame.source)
         elif drawn:
             around = around_mask(np.max(drawn, axis=0))
-        found = estimator(only(image, around), picture.seconds)
+        found = estimator(only(image, around), frame.seconds)
         mask = clean_mask(found.mask)
         if len(given) > 1:
             overlaps.append(tuple(np.nan if m is None else overlap(m > 127, mask > 127) for m in own))
@@ -133,13 +133,13 @@ def watch_clip(
             save_picture(masks[-1], mask, compress_level=1)
         # The mask is a file now; keeping it would fill the memory.
         seen.append(Observation(found.pixels, found.visibility, found.world, np.zeros((1, 1), np.uint8)))
-        sources.append((picture.source, picture.seconds, picture.step))
+        sources.append((frame.source, frame.seconds, frame.step))
         if number % max(1, expected // _SAMPLES) == 0:
             sample.append(image)
         if number % max(1, expected // _VIEWS) == 0:
             views.append(surroundings_of(image, mask))
         if show is not None:
-            show(min(1.0, (picture.index + 1) / max(expected, 1)))
+            show(min(1.0, (frame.index + 1) / max(expected, 1)))
     if not images:
         raise TwofoldError("A clip without any image cannot be prepared; choose another.")
     places, seconds, steps = zip(*sources, strict=True)

@@ -18,7 +18,7 @@ from twofold.prepare.turning import FULL_TURN
 MOST_REPROJECTION, LEAST_VISIBILITY = 4.0, 0.5
 """An image above, below these is left out: measured on real clips, failed fits lie well beyond."""
 
-LEAST_PICTURES = 12
+MIN_IMAGES = 12
 """Fewer show too little of a person to learn how it moves."""
 
 LARGER = "film one whole person, well lit and large enough, and try again"
@@ -32,7 +32,7 @@ _ENDS = ("nose", "left_ankle", "right_ankle", "left_wrist", "right_wrist")
 
 
 @dataclass(frozen=True)
-class PictureQuality:
+class ImageQuality:
     """How well one image is understood.
 
     Attributes:
@@ -63,7 +63,7 @@ class PictureQuality:
         }
 
 
-def picture_quality(
+def image_quality(
     camera_name: str,
     camera: Camera,
     time: int,
@@ -73,7 +73,7 @@ def picture_quality(
     visibility: Float[np.ndarray, "33"],
     height: float,
     alone: bool = True,
-) -> PictureQuality:
+) -> ImageQuality:
     """The record of one image.
 
     Args:
@@ -102,7 +102,7 @@ def picture_quality(
         fault = f"the body does not cover the mask (IoU {iou:.2f}, at least {LEAST_IOU})"
     elif alone and percent > MOST_REPROJECTION:
         fault = f"the body misses the landmarks ({percent:.1f} % of its height, at most {MOST_REPROJECTION:g} %)"
-    return PictureQuality(camera_name, time, iou, error, percent, mean, cropped, fault)
+    return ImageQuality(camera_name, time, iou, error, percent, mean, cropped, fault)
 
 
 def _beyond(pixel: Float[np.ndarray, "2"], camera: Camera, margin: float) -> bool:
@@ -111,15 +111,15 @@ def _beyond(pixel: Float[np.ndarray, "2"], camera: Camera, margin: float) -> boo
     return bool(np.isfinite(pixel).all() and ((pixel < -margin * size) | (pixel > (1 + margin) * size)).any())
 
 
-def require_length(pictures: int, clip: str) -> None:
+def require_length(images: int, clip: str) -> None:
     """Refuses clips that are too short.
 
     Raises:
-        TwofoldError: there are fewer images than `LEAST_PICTURES`.
+        TwofoldError: there are fewer images than `MIN_IMAGES`.
     """
-    if pictures < LEAST_PICTURES:
+    if images < MIN_IMAGES:
         raise TwofoldError(
-            f"{clip} has {pictures} images, expected at least {LEAST_PICTURES} (a few seconds of a moving person); "
+            f"{clip} has {images} images, expected at least {MIN_IMAGES} (a few seconds of a moving person); "
             "film longer, or raise --fps if it was lowered."
         )
 
@@ -141,7 +141,7 @@ def require_person(track: Track, clip: str, advice: str = LARGER) -> None:
         raise TwofoldError(f"{clip} shows {found}; {advice}.")
 
 
-def require_whole(qualities: Sequence[PictureQuality], clip: str, advice: str = FARTHER) -> None:
+def require_whole(qualities: Sequence[ImageQuality], clip: str, advice: str = FARTHER) -> None:
     """Refuses clips in which the person is cut off by the image's edge most of the time.
 
     Args:
@@ -160,7 +160,7 @@ def require_whole(qualities: Sequence[PictureQuality], clip: str, advice: str = 
 
 
 def kept_times(
-    qualities: Sequence[PictureQuality], clip: str, advice: str = STEADIER, drop: Sequence[int] = ()
+    qualities: Sequence[ImageQuality], clip: str, advice: str = STEADIER, drop: Sequence[int] = ()
 ) -> tuple[list[int], dict[int, str]]:
     """Frames at which no camera's image is bad, and why each other one is left out.
 
@@ -198,7 +198,7 @@ def warnings_about(
 
     Args:
         yaw: from `turning.arc`, over the training camera.
-        moved: how far the background moves, pixels; None where that cannot be told.
+        moved: how far the background moves, pixels; None where that is unknown.
         width: of the images.
         left_out: frames left out, and why.
         several: more than one camera saw the person, so that one camera's yaw says less.

@@ -20,7 +20,7 @@ from twofold.prepare.detect.scan import Watched, save_picture, spread_out
 from twofold.prepare.fitting.body_landmarks import body_points
 from twofold.prepare.fitting.outlines import open_mask
 from twofold.prepare.fitting.parameters import Motion, Posed, choose, place_points, pose_motion
-from twofold.prepare.output.acceptance import PictureQuality, picture_quality
+from twofold.prepare.output.acceptance import ImageQuality, image_quality
 from twofold.prepare.output.held_objects import SeenBody, see_body, usual_colors
 from twofold.prepare.output.object_tracks import Patch, Sighting, foreign_patches, moving_objects, without
 from twofold.prepare.silhouettes import overlap, silhouette
@@ -39,7 +39,7 @@ class Agreement:
         removed: share of the person's mask that these take, by frame.
     """
 
-    qualities: tuple[PictureQuality, ...]
+    qualities: tuple[ImageQuality, ...]
     ignored: dict[int, Path]
     removed: dict[int, float]
 
@@ -93,7 +93,7 @@ def compare_with_pictures(
             return None
         return foreign_patches(open_mask(watched.masks[time]), read_rgb(watched.images[time]), seen, *usual)
 
-    def judge(time: int) -> PictureQuality:
+    def judge(time: int) -> ImageQuality:
         mask, iou = open_mask(watched.masks[time]), 0.0
         vertices = stand(time)
         if float(project(camera, vertices)[1].min()) > 0.01 and (mask > 127).any():
@@ -106,11 +106,11 @@ def compare_with_pictures(
             counted = None if time not in ignored else open_mask(ignored[time]) == 0
             iou = overlap(silhouette(camera, vertices, body.faces), mask > 127, counted)
         track = watched.track
-        return picture_quality(
+        return image_quality(
             name, camera, time, iou, shown[time], track.pixels[time], track.visibility[time], size, alone
         )
 
-    qualities: list[PictureQuality] = []
+    qualities: list[ImageQuality] = []
     # Painting, comparing and writing images leave the interpreter free most of the time.
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
         if usual is not None:

@@ -95,7 +95,7 @@ def describe_video(path: Path) -> VideoInfo:
     with _opened(path) as (container, stream):
         remarks: list[str] = []
         stated = stream.average_rate or stream.guessed_rate
-        first = next(_pictures(container, stream, []), None)
+        first = next(_images(container, stream, []), None)
         if first is None:
             raise TwofoldError(f"No image of {path} can be decoded; it is damaged or empty, export it again.")
         matrix = first.side_data.get("DISPLAYMATRIX")
@@ -153,7 +153,7 @@ def decode(path: Path, info: VideoInfo, remarks: list[str]) -> Generator[tuple[f
     damaged: list[str] = []
     start, last, count, jumps = 0.0, -1 / info.fps, 0, 0
     with _opened(path) as (container, stream):
-        for frame in _pictures(container, stream, damaged):
+        for frame in _images(container, stream, damaged):
             expected = last + 1 / info.fps
             clock = start + expected if frame.pts is None else frame.time
             start = clock if count == 0 else start
@@ -228,7 +228,7 @@ def _opened(path: Path) -> Generator[tuple[InputContainer, VideoStream]]:
         yield container, stream
 
 
-def _pictures(container: InputContainer, stream: VideoStream, damaged: list[str]) -> Iterator[av.VideoFrame]:
+def _images(container: InputContainer, stream: VideoStream, damaged: list[str]) -> Iterator[av.VideoFrame]:
     """All images that can be decoded; what cannot is noted in `damaged`."""
     packets = container.demux(stream)
     while True:

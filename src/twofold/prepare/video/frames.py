@@ -15,7 +15,7 @@ from twofold.images import load_image, read_header, upright_size
 from twofold.prepare.video.decoding import Converter, VideoInfo, decode, describe_video
 from twofold.prepare.video.intensity import deep_values, to_8_bits, white_level
 
-PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 USUAL_FPS = 30.0
 """Taken for a folder of images, which cannot say it."""
 Item = TypeVar("Item")
@@ -56,7 +56,7 @@ class ClipInfo:
 
 
 @dataclass(frozen=True)
-class Picture:
+class VideoFrame:
     """One image of a clip.
 
     Attributes:
@@ -100,7 +100,7 @@ class Frames:
         self._even = even or fps is not None
         self.remarks = self.info.remarks
 
-    def __iter__(self) -> Iterator[Picture]:
+    def __iter__(self) -> Iterator[VideoFrame]:
         """Every image.
 
         Raises:
@@ -109,7 +109,7 @@ class Frames:
         self.remarks = self.info.remarks
         if self._video is None:
             for index, path in enumerate(self._files):
-                yield Picture(index, index / self.info.fps, read_picture(path, self.info), index, index)
+                yield VideoFrame(index, index / self.info.fps, read_picture(path, self.info), index, index)
             return
         late: list[str] = []
         convert = Converter(self._video, self.info.width, self.info.height)
@@ -118,7 +118,7 @@ class Frames:
         for index, (step, source, seconds, frame) in enumerate(
             nearest_to_steps(timed, self.info.fps) if self._even else numbered
         ):
-            yield Picture(index, seconds, convert(frame), source, step)
+            yield VideoFrame(index, seconds, convert(frame), source, step)
         self.remarks = (*self.info.remarks, *late)
 
 
@@ -188,7 +188,7 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
     Raises:
         TwofoldError: there is none.
     """
-    return files_with(folder, PICTURE_ENDINGS, "images; expected PNG or JPEG files, one for each frame")
+    return files_with(folder, IMAGE_ENDINGS, "images; expected PNG or JPEG files, one for each frame")
 
 
 def files_with(folder: Path, endings: tuple[str, ...], what: str) -> tuple[Path, ...]:

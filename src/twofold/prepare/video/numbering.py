@@ -25,7 +25,7 @@ class Numbering:
 
     Attributes:
         words: what it takes them for, for messages: "counted from 0".
-        places: files by `Picture.source`.
+        places: files by `VideoFrame.source`.
     """
 
     words: str
