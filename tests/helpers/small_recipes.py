@@ -80,6 +80,8 @@ def shrunk_skeletal(recipe: Recipe) -> Recipe:
     changed = {"samples": 32, "volume_channels": (16, 16, 16, 8), "volume_code": 8, "hidden_dtype": "float32"}
     changed |= {"volume_every": min(recipe.method.skeletal.volume_every, 2), "guard_frames": 2, "guard_size": 16}
     method = replace(recipe.method, skeletal=replace(recipe.method.skeletal, **changed))
+    if hasattr(method, "features_every"):
+        method = replace(method, features_every=min(method.features_every, 2))
     pixels = replace(recipe.training.pixels, rays=min(recipe.training.pixels.rays, 64), patches=1, patch_size=16)
     return replace(recipe, method=method, training=replace(recipe.training, pixels=pixels))
 

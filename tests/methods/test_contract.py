@@ -11,6 +11,7 @@ from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigi
 from twofold.losses import total
 from twofold.methods.base import Mode, Rendering
 from twofold.methods.boxed_avatar import BoxedAvatar
+from twofold.methods.monohuman import MonoHumanAvatar
 from twofold.methods.skeletal import SkeletalAvatar
 from twofold.methods.subject import Subject
 from twofold.methods.table import RECIPES
@@ -137,6 +138,8 @@ def test_losses_are_finite_and_every_parameter_learns(name, subject, person):
     """Of every ablation, too."""
     recipe = CASES[name]
     avatar = opaque(recipe.method.build(subject, 0)).train()
+    if isinstance(avatar, MonoHumanAvatar):  # Nothing can be learned from key frames that are black.
+        avatar.prepare_training(person, 0, torch.Generator())
     source = PixelSource(person.train, person.body, person.betas, recipe.training.pixels)
     for which in (0, 3):
         generator = torch.Generator().manual_seed(which)

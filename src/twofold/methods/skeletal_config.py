@@ -103,7 +103,7 @@ class SkeletalPose:
     weights: Float[Tensor, "c z y x"]
     condition: Float[Tensor, "69"]
     open_bands: float
-    maps: Float[Tensor, "v c i j"] | None = None
+    maps: Float[Tensor, "v f i j"] | None = None
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,12 @@ from typing import Any, cast
 from twofold.config import KIND, from_dict, to_dict, with_overrides
 from twofold.errors import TwofoldError
 from twofold.inputs import shown
-from twofold.methods import danbo, factorized_recipes, humannerf, npc, pm_avatar, vid2avatar_recipes
+from twofold.methods import danbo, factorized_recipes, humannerf, monohuman, npc, pm_avatar, vid2avatar_recipes
 from twofold.methods.base import MethodConfig
 from twofold.methods.danbo import DanboConfig
 from twofold.methods.factorized import FactorizedConfig
 from twofold.methods.humannerf import HumanNerfConfig
+from twofold.methods.monohuman import MonoHumanConfig
 from twofold.methods.npc import NpcConfig
 from twofold.methods.pm_avatar import PmAvatarConfig
 from twofold.methods.stored import completed
@@ -32,6 +33,7 @@ METHODS: dict[str, Method] = {
     "factorized": Method(FactorizedConfig, factorized_recipes.RECIPES),
     "danbo": Method(DanboConfig, danbo.RECIPES),
     "humannerf": Method(HumanNerfConfig, humannerf.RECIPES),
+    "monohuman": Method(MonoHumanConfig, monohuman.RECIPES),
     "npc": Method(NpcConfig, npc.RECIPES),
     "pm_avatar": Method(PmAvatarConfig, pm_avatar.RECIPES),
     "vid2avatar": Method(Vid2AvatarConfig, vid2avatar_recipes.RECIPES),

@@ -349,7 +349,9 @@ class _Run:
                 "capture with `twofold check`, or choose another --seed."
             )
         self.step = 0
-        self.avatar.load_state_dict(self.recipe.method.build(self.avatar.subject, self.seed).state_dict())
+        state = self.recipe.method.build(self.avatar.subject, self.seed).state_dict()
+        self.avatar.load_stored(state)
+        self.avatar.load_state_dict(state)
         self._enter(0, prepared=False)
 
 
