@@ -41,6 +41,18 @@ def test_alpha_weights_are_the_literal_product(rays):
     torch.testing.assert_close(alpha_weights(alpha, index), torch.tensor(expected, dtype=torch.float64))
 
 
+@given(st.lists(st.lists(st.floats(0, 1.5), min_size=1, max_size=6), min_size=1, max_size=4))
+def test_alphas_above_one_give_the_literal_product_with_its_sign(rays):
+    alpha, index = packed(rays)
+    expected = [a * math.prod(1 - b + 1e-10 for b in ray[:i]) for ray in rays for i, a in enumerate(ray)]
+    torch.testing.assert_close(alpha_weights(alpha, index), torch.tensor(expected, dtype=torch.float64))
+
+
+def test_gradients_by_alphas_above_one_are_those_of_finite_differences():
+    alpha = torch.tensor([0.3, 1.2, 0.9, 1.4, 0.2], dtype=torch.float64, requires_grad=True)
+    torch.autograd.gradcheck(lambda a: alpha_weights(a, torch.tensor([0, 0, 0, 1, 1])), alpha)
+
+
 @given(RAYS)
 def test_density_weights_are_the_literal_exponentials(rays):
     density, index = packed(rays)

@@ -13,6 +13,8 @@ CANONICAL_OCTAVES = 10
 NON_RIGID_OCTAVES = 6
 IMAGE_FEATURES = 35
 """Columns of MonoHuman's blended key-frame features: colour and 32 features of `field.resunet`."""
+TIE = 1e-4
+"""Share of a squared distance by which two bones may differ and count as equally near."""
 
 
 class NonRigidMotion(nn.Module):
@@ -113,4 +115,8 @@ def offset_to_nearest_bone(x_canonical: Float[Tensor, "S 3"], joints: Float[Tens
     offset = x_canonical[:, None] - start
     fraction = (offset * along).sum(-1) / along.square().sum(-1).clamp_min(1e-12)
     squared = (offset - fraction.clamp(0, 1)[..., None] * along).square().sum(-1)
-    return x_canonical - start[squared.argmin(-1)]
+    # Two bones that share a joint are equally near wherever that joint is the nearest point: the first one counts, not
+    # rounding.
+    near = squared <= squared.amin(-1, keepdim=True) * (1 + TIE) + TIE**2
+    first = torch.where(near, torch.arange(len(start), device=near.device), len(start) - 1).amin(-1)
+    return x_canonical - start[first]

@@ -58,12 +58,15 @@ def alpha_weights(alpha: Float[Tensor, "S"], ray_index: Int[Tensor, "S"]) -> Flo
     tensor([0.5000, 0.2500, 1.0000])
 
     Args:
-        alpha: of each sample, 0..1; for HumanNeRF times the likelihood that the sample belongs to the person.
+        alpha: of each sample, 0..1; for HumanNeRF times the likelihood that the sample belongs to the person, which
+            may be a little more than one. The product is then negative, as in the authors' programs.
         ray_index: the ray of each sample, ascending.
     """
     # The product as a running sum of logarithms over all rays, in double precision: each ray's own start is taken off.
-    log_through = torch.log(1 - alpha.double() + ALPHA_OFFSET)
-    return alpha * torch.exp(_sum_before(log_through, ray_index)).to(alpha.dtype)
+    factor = 1 - alpha.double() + ALPHA_OFFSET
+    through = torch.exp(_sum_before(factor.abs().log(), ray_index))
+    negative = _sum_before((factor.detach() < 0).double(), ray_index) % 2
+    return alpha * (through * (1 - 2 * negative)).to(alpha.dtype)
 
 
 def open_density_weights(
