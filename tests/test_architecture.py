@@ -156,3 +156,43 @@ def settings_of(config, prefix=""):
     for key, value in config.items():
         leaves |= settings_of(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return leaves
+
+
+SAME_IDEA = {
+    "factorized": {"field/factorized", "methods/factorized"},
+    "video": {"metrics/video", "outputs/video"},
+    "bvh": {"body/bvh", "outputs/export/bvh"},
+}
+"""Modules that share a name because they are the same idea in two packages: the field and the method made of it,
+measures of videos and their files, motions and characters as BVH."""
+
+
+def test_no_two_modules_share_a_name_but_those_of_one_idea():
+    named: dict[str, set[str]] = {}
+    for file in (ROOT / "src" / "twofold").rglob("*.py"):
+        if not file.stem.startswith("__"):
+            module = file.relative_to(ROOT / "src" / "twofold").with_suffix("")
+            named.setdefault(file.stem, set()).add(module.as_posix())
+    assert {name: modules for name, modules in named.items() if len(modules) > 1} == SAME_IDEA
+
+
+def test_no_two_public_classes_share_a_name():
+    named: dict[str, list[str]] = {}
+    for module, file in citations.modules().items():
+        for node in ast.parse(file.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                named.setdefault(node.name, []).append(module)
+    assert not {name: modules for name, modules in named.items() if len(modules) > 1}
+
+
+def test_tests_named_after_a_module_stand_where_it_stands():
+    source = ROOT / "src" / "twofold"
+    modules: dict[str, set[Path]] = {}
+    for file in source.rglob("*.py"):
+        modules.setdefault(file.stem, set()).add(file.parent.relative_to(source))
+    misplaced = [
+        str(file.relative_to(ROOT))
+        for file in (ROOT / "tests").rglob("test_*.py")
+        if file.stem[5:] in modules and file.parent.relative_to(ROOT / "tests") not in modules[file.stem[5:]]
+    ]
+    assert not misplaced

@@ -17,7 +17,7 @@ from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.prepare.detections import Track
 from twofold.prepare.fitting.body_landmarks import body_points
 from twofold.prepare.fitting.observations import Evidence
-from twofold.prepare.fitting.parameters import Motion, choose, place_joints, place_points, pose_motion
+from twofold.prepare.fitting.parameters import FittedMotion, choose, place_joints, place_points, pose_motion
 
 HEIGHT, WIDTH = 200, 160
 HIPS = (23, 24)
@@ -44,7 +44,7 @@ def random_motion(body, moments=4, seed=0, size=0.4, dtype=torch.float32):
     def random(*shape):
         return torch.randn(shape, generator=generator, dtype=torch.float64)
 
-    motion = Motion(
+    motion = FittedMotion(
         guess=axis_angle_to_matrix(2 * random(moments, 3)), root=size * random(moments, 3),
         pose=size * random(moments, 23, 3), translation=random(moments, 3) + torch.tensor([0.0, 0.0, 6.0]),
         betas=0.5 * random(body.shape_basis.shape[-1]), marks=0.02 * random(33, 3), log_focal=0.1 * random(),
@@ -71,7 +71,7 @@ def acted(body, moments=12, fps=10.0, turn=1.0, heading=0.0, betas=0.4):
     shape = torch.zeros(body.shape_basis.shape[-1])
     shape[0] = betas
     rest = body.joints[0] + body.joint_basis[0, :, : len(shape)] @ shape
-    return Motion(
+    return FittedMotion(
         guess=axis_angle_to_matrix(root), root=torch.zeros(moments, 3), pose=pose, translation=walk - rest,
         betas=shape, marks=torch.zeros(33, 3), log_focal=torch.zeros(()), log_distance=torch.zeros(()),
     )  # fmt: skip

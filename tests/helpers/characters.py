@@ -7,21 +7,21 @@ import torch
 from tiny_person import person_body
 
 from twofold.outputs.export.atlas import as_bytes_image, paint_texture, unwrap
-from twofold.outputs.export.character import Character, Clip
+from twofold.outputs.export.character import Animation, Character
 from twofold.outputs.export.lattice import build_lattice
 from twofold.outputs.export.rig import keep_largest_weights
 
 FRAMES, TARGETS = 9, 3
 
 
-def random_clip(seed: int = 0, frames: int = FRAMES, targets: int = TARGETS, fps: float = 12) -> Clip:
+def random_clip(seed: int = 0, frames: int = FRAMES, targets: int = TARGETS, fps: float = 12) -> Animation:
     """Large rotations of every joint, far from home."""
     random = np.random.default_rng(seed)
     poses = random.normal(0, 0.5, (frames, 24, 3)).astype(np.float32)
     poses[:, 0] *= 3
     places = random.normal(0, 1, (frames, 3)).astype(np.float32)
     weights = random.normal(0, 1, (frames, targets)).astype(np.float32)
-    return Clip("random", (np.arange(frames) / fps).astype(np.float32), poses, places, weights)
+    return Animation("random", (np.arange(frames) / fps).astype(np.float32), poses, places, weights)
 
 
 def small_character(texture: int = 64, targets: int = TARGETS, lit: bool = False) -> Character:
@@ -55,6 +55,6 @@ def as_still(character: Character) -> Character:
     return replace(character, targets=character.targets[:0], clips=(), rigged=False)
 
 
-def pose_tensors(clip: Clip, frame: int) -> tuple[torch.Tensor, torch.Tensor]:
+def pose_tensors(clip: Animation, frame: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Pose and translation of a frame."""
     return torch.from_numpy(clip.poses[frame]), torch.from_numpy(clip.translations[frame])

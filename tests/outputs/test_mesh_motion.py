@@ -7,7 +7,7 @@ from twofold.body.builtin_motions import BUILTIN_MOTIONS
 from twofold.body.motion import as_single, resampled
 from twofold.capture.folder import read_capture
 from twofold.outputs.export.bake import BakeConfig
-from twofold.outputs.export.character import Clip, pose_character
+from twofold.outputs.export.character import Animation, pose_character
 from twofold.outputs.mesh_motion import clip_renderer, mesh_renderer
 from twofold.outputs.mesh_preview import draw_mesh
 from twofold.outputs.motion_cameras import motion_cameras
@@ -21,7 +21,7 @@ def test_a_frame_is_the_posed_and_morphed_character():
     poses = 0.2 * np.random.default_rng(0).normal(size=(3, 24, 3)).astype(np.float32)
     places = np.zeros((3, 3), np.float32)
     weights = np.random.default_rng(1).normal(size=(3, targets)).astype(np.float32)
-    clip = Clip("clip", np.arange(3, dtype=np.float32), poses, places, weights)
+    clip = Animation("clip", np.arange(3, dtype=np.float32), poses, places, weights)
     from test_mesh_preview import camera
 
     view = clip_renderer(character, clip)(2, camera())

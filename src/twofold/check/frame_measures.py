@@ -212,7 +212,7 @@ def splat(pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"], height: int, 
 
 
 @dataclass(frozen=True)
-class Look:
+class LookedAt:
     """An image opened, with the body drawn into it.
 
     Attributes:
@@ -251,7 +251,7 @@ def look_at(
     mask: UInt8[np.ndarray, "h w"],
     longest: int = LOOKED_AT,
     aspect: float | None = None,
-) -> Look:
+) -> LookedAt:
     """Draws the posed body into the part of the image that holds it and the mask; see `window_of`."""
     vertices = posed_points(shaped, frame.pose, frame.translation)
     pixels, depth = project(frame.camera, vertices)
@@ -260,7 +260,7 @@ def look_at(
     body = np.zeros(window.camera.height * window.camera.width, bool)
     body[hits.pixel.numpy()] = True
     ignored = frame.ignored().numpy().astype(np.uint8) * 255
-    return Look(
+    return LookedAt(
         window, window.mask(mask), ~window.mask(ignored), hits,
         body.reshape(window.camera.height, window.camera.width),
     )  # fmt: skip

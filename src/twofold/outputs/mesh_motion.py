@@ -8,9 +8,9 @@ from twofold.body.motion import Motion
 from twofold.capture.types import Capture
 from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
+from twofold.outputs.export.animations import motion_clip
 from twofold.outputs.export.bake import BakeConfig
-from twofold.outputs.export.character import Character, Clip, pose_character
-from twofold.outputs.export.clips import motion_clip
+from twofold.outputs.export.character import Animation, Character, pose_character
 from twofold.outputs.export.make import bake
 from twofold.outputs.mesh_preview import as_tensor, draw_mesh
 from twofold.outputs.motion_video import Renderer, View
@@ -44,7 +44,7 @@ def mesh_renderer(
     return clip_renderer(baked.character, clip)
 
 
-def clip_renderer(character: Character, clip: Clip) -> Renderer:
+def clip_renderer(character: Character, clip: Animation) -> Renderer:
     """Renders the frames of a character's clip; colours are shown as they are."""
 
     def view(index: int, camera: Camera) -> View:

@@ -17,7 +17,7 @@ from twofold.prepare.detect.mask_files import GivenMasks, masks_from_folder
 from twofold.prepare.detect.people import Person
 from twofold.prepare.detect.person import JOINT_LINES, Region, around_landmarks, around_lines, following
 from twofold.prepare.detections import Track
-from twofold.prepare.fitting.parameters import Motion, place_joints, pose_motion
+from twofold.prepare.fitting.parameters import FittedMotion, place_joints, pose_motion
 from twofold.prepare.fitting.pose_files import poses_from_file
 from twofold.prepare.output.acceptance import LARGER, require_person
 from twofold.prepare.video.clips import Clip, PrepareConfig, advice
@@ -40,7 +40,7 @@ class Given:
 
     masks: GivenMasks | None = None
     landmarks: tuple[tuple[str, Track], ...] = ()
-    motion: Motion | None = None
+    motion: FittedMotion | None = None
 
 
 def read_given(ready: Sequence[Clip], config: PrepareConfig, body: Body) -> list[Given]:
@@ -106,7 +106,9 @@ def region_finder(
             yield None
 
 
-def _around_poses(motion: Motion, clip: Clip, body: Body) -> Callable[[UInt8[np.ndarray, "h w 3"], int], Region | None]:
+def _around_poses(
+    motion: FittedMotion, clip: Clip, body: Body
+) -> Callable[[UInt8[np.ndarray, "h w 3"], int], Region | None]:
     pixels, depth = project(clip.camera, place_joints(pose_motion(body, motion), body, motion))
     shown: Float[np.ndarray, "t 24 2"] = np.where((depth > 0)[..., None].numpy(), pixels.numpy(), np.nan)
 

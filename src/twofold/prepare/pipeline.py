@@ -27,7 +27,7 @@ from twofold.prepare.detect.scan import Watched, watch_clip, with_masks
 from twofold.prepare.detections import Estimator, Track
 from twofold.prepare.fitting.fit import fit
 from twofold.prepare.fitting.observations import Evidence
-from twofold.prepare.fitting.parameters import Motion, choose, pose_motion, root_of
+from twofold.prepare.fitting.parameters import FittedMotion, choose, pose_motion, root_of
 from twofold.prepare.fitting.pose_files import motion_at
 from twofold.prepare.fitting.world_up import stand_upright, up_direction
 from twofold.prepare.given import Finder, Given, chosen_landmarks, chosen_masks, read_given, region_finder
@@ -213,7 +213,7 @@ def _watch_all(
 class _Found:
     """The fit: a motion in a world of its own, its cameras, and what they saw with the sides put right."""
 
-    motion: Motion
+    motion: FittedMotion
     cameras: dict[str, Camera]
     watched: list[Watched]
     fps: float
@@ -285,7 +285,7 @@ def _judge_all(found: _Found, body: Body, config: PrepareConfig, show: Show) -> 
     return agreed
 
 
-def _standing(motion: Motion, body: Body, camera: Camera) -> float:
+def _standing(motion: FittedMotion, body: Body, camera: Camera) -> float:
     """How tall the person would stand in the image at its usual distance, pixels."""
     vertices = pose_motion(body, motion).vertices
     height = float(vertices[:, 1].max() - vertices[:, 1].min())

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from twofold.body.skeleton import joint_transforms
 from twofold.errors import TwofoldError
 from twofold.outputs.export.bvh import evenly_spaced, write_bvh
-from twofold.outputs.export.character import Clip
+from twofold.outputs.export.character import Animation
 from twofold.outputs.export.options import ExportOptions
 from twofold.outputs.export.rig import joint_names
 
@@ -68,7 +68,7 @@ def test_missing_frames_are_interpolated() -> None:
     clip = random_clip(frames=5, fps=10)
     clip.poses[:] *= 0.3
     kept = [0, 1, 3, 4]
-    gaps = Clip("gaps", clip.times[kept], clip.poses[kept], clip.translations[kept])
+    gaps = Animation("gaps", clip.times[kept], clip.poses[kept], clip.translations[kept])
     filled = evenly_spaced(gaps)
     assert np.allclose(filled.times, clip.times)
     assert np.allclose(filled.poses[kept], clip.poses[kept], atol=1e-5)

@@ -15,8 +15,8 @@ from twofold.errors import TwofoldError
 from twofold.geometry.surfaces import point_to_mesh
 from twofold.methods.base import Avatar
 from twofold.outputs.export import write
+from twofold.outputs.export.animations import capture_clip, grounded, turned, upright
 from twofold.outputs.export.bake import BakeConfig
-from twofold.outputs.export.clips import capture_clip, grounded, turned, upright
 from twofold.outputs.export.make import Baked, bake, still
 from twofold.outputs.export.morphs import pull_back
 from twofold.outputs.export.repair import is_watertight

@@ -14,7 +14,7 @@ from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.prepare.detections import LANDMARKS
 from twofold.prepare.fitting.body_landmarks import body_points
 from twofold.prepare.fitting.initialization import first_pose, first_translation, register, shortest_turns, twisted
-from twofold.prepare.fitting.parameters import Motion, place_points, pose_motion
+from twofold.prepare.fitting.parameters import FittedMotion, place_points, pose_motion
 
 seeds = st.integers(0, 10**6)
 TURNED = ("hip", "knee", "ankle", "shoulder", "elbow")
@@ -30,7 +30,7 @@ def posed(body, root, pose, translation=None):
     """Landmarks of the mean body, exact."""
     count = len(root)
     still = torch.zeros(count, 3)
-    motion = Motion(
+    motion = FittedMotion(
         guess=root, root=still, pose=pose, translation=still if translation is None else translation,
         betas=torch.zeros(body.shape_basis.shape[-1]), marks=torch.zeros(33, 3), log_focal=torch.zeros(()),
         log_distance=torch.zeros(()),

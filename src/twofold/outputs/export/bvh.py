@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from twofold.body.skeleton import JOINT_NAMES, PARENTS
 from twofold.errors import TwofoldError
 from twofold.files import write_bytes
-from twofold.outputs.export.character import Character, Clip
+from twofold.outputs.export.character import Animation, Character
 from twofold.outputs.export.options import ExportOptions
 from twofold.outputs.export.rig import joint_names
 
@@ -37,7 +37,7 @@ def write_bvh(character: Character, path: Path, options: ExportOptions) -> None:
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
-def evenly_spaced(clip: Clip) -> Clip:
+def evenly_spaced(clip: Animation) -> Animation:
     """The clip at its smallest frame distance throughout; rotations by slerp, translations linear."""
     if len(clip.times) < 3 or np.allclose(np.diff(clip.times), clip.times[1] - clip.times[0], rtol=1e-3):
         return clip
@@ -47,12 +47,12 @@ def evenly_spaced(clip: Clip) -> Clip:
     turned = [Slerp(clip.times, Rotation.from_rotvec(clip.poses[:, j]))(times).as_rotvec() for j in range(24)]
     places = [np.interp(times, clip.times, clip.translations[:, axis]) for axis in range(3)]
     dtype = clip.poses.dtype
-    return Clip(
+    return Animation(
         clip.name, times.astype(clip.times.dtype), np.stack(turned, 1).astype(dtype), np.stack(places, 1).astype(dtype)
     )
 
 
-def channels(character: Character, clip: Clip) -> Iterator[list[float]]:
+def channels(character: Character, clip: Animation) -> Iterator[list[float]]:
     """The numbers of each frame: position of the pelvis (cm), then Euler angles (degrees), joint by joint as listed."""
     order = list(_depth_first(0))
     pelvis = CENTIMETRES * (clip.translations + character.joints[0])
@@ -61,7 +61,7 @@ def channels(character: Character, clip: Clip) -> Iterator[list[float]]:
         yield [*place.tolist(), *angles.tolist()]
 
 
-def _spacing(clip: Clip) -> float:
+def _spacing(clip: Animation) -> float:
     return float(clip.times[1] - clip.times[0]) if len(clip.times) > 1 else 1 / 30
 
 

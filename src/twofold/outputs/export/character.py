@@ -12,7 +12,7 @@ from twofold.outputs.export.atlas import Atlas
 
 
 @dataclass(frozen=True)
-class Clip:
+class Animation:
     """A motion of the character.
 
     Attributes:
@@ -57,7 +57,7 @@ class Character:
     joints: Float[np.ndarray, "24 3"]
     weights: Float[np.ndarray, "V 24"]
     targets: Float[np.ndarray, "M V 3"]
-    clips: tuple[Clip, ...]
+    clips: tuple[Animation, ...]
     colors: Float[np.ndarray, "V 3"]
     atlas: Atlas | None = None
     texture: UInt8[np.ndarray, "h w 3"] | None = None

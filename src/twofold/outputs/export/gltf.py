@@ -17,7 +17,7 @@ from twofold import __version__
 from twofold.body.skeleton import PARENTS
 from twofold.files import write_bytes
 from twofold.outputs.export.atlas import tangents
-from twofold.outputs.export.character import Character, Clip, normals_of
+from twofold.outputs.export.character import Animation, Character, normals_of
 from twofold.outputs.export.options import ExportOptions
 from twofold.outputs.export.rig import joint_names
 
@@ -216,7 +216,7 @@ def _skin(character: Character, chunk: BinaryChunk, lift: np.ndarray) -> dict[st
     }
 
 
-def _animation(character: Character, clip: Clip, chunk: BinaryChunk) -> dict[str, Any]:
+def _animation(character: Character, clip: Animation, chunk: BinaryChunk) -> dict[str, Any]:
     times = chunk.accessor((clip.times - clip.times[0]).astype(np.float32), bounds=True)
     outputs = {("translation", FIRST_JOINT): (clip.translations + character.joints[0]).astype(np.float32)}
     rotations = quaternions(clip.poses)

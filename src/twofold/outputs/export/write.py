@@ -14,9 +14,9 @@ from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors, write_json
 from twofold.methods.base import Avatar
+from twofold.outputs.export.animations import capture_clip, grounded, motion_clip, turned, upright
 from twofold.outputs.export.bake import BakeConfig, Progress
-from twofold.outputs.export.character import Character, Clip
-from twofold.outputs.export.clips import capture_clip, grounded, motion_clip, turned, upright
+from twofold.outputs.export.character import Animation, Character
 from twofold.outputs.export.formats import EXPORTERS
 from twofold.outputs.export.make import Baked, bake, frame_at, still
 from twofold.outputs.export.options import ExportOptions
@@ -125,9 +125,9 @@ def export(
     return written
 
 
-def _clips(baked: Baked, capture_motion: bool, motions: Sequence[Motion]) -> list[Clip]:
+def _clips(baked: Baked, capture_motion: bool, motions: Sequence[Motion]) -> list[Animation]:
     character, pelvis = baked.character, baked.character.joints[0]
-    clips: list[Clip] = []
+    clips: list[Animation] = []
     if capture_motion:
         clips.append(grounded(turned(capture_clip(baked), upright(baked.capture), pelvis), character))
     for motion in motions:

@@ -12,7 +12,15 @@ from twofold.kernels.kdtree import search_tree
 from twofold.prepare.fitting.body_landmarks import BodyPoints
 from twofold.prepare.fitting.observations import Seen
 from twofold.prepare.fitting.outlines import Outlines
-from twofold.prepare.fitting.parameters import Chosen, Motion, Posed, choose, place_joints, place_points, pose_motion
+from twofold.prepare.fitting.parameters import (
+    Chosen,
+    FittedMotion,
+    Posed,
+    choose,
+    place_joints,
+    place_points,
+    pose_motion,
+)
 
 STIFFNESS = {
     "hip": 0.9, "knee": 1.2, "ankle": 0.35, "foot": 0.1, "spine": 0.35, "neck": 0.3, "collar": 0.25, "head": 0.35,
@@ -60,7 +68,7 @@ def _robust(squared: Tensor) -> Tensor:
     return squared / (1 + squared)
 
 
-def landmark_term(posed: Posed, points: BodyPoints, motion: Motion, seen: Seen, error: float) -> Tensor:
+def landmark_term(posed: Posed, points: BodyPoints, motion: FittedMotion, seen: Seen, error: float) -> Tensor:
     """Landmarks beside where they are seen; `error` in percent of the person's height in the image."""
     places = place_points(posed, points, motion)
     loss = places.new_zeros(())
@@ -80,7 +88,7 @@ _BONES = (
 """Pairs of landmarks with a direction worth knowing."""
 
 
-def direction_term(posed: Posed, points: BodyPoints, motion: Motion, seen: Seen, error: float) -> Tensor:
+def direction_term(posed: Posed, points: BodyPoints, motion: FittedMotion, seen: Seen, error: float) -> Tensor:
     """Bones that run another way than the estimator's; `error` as the length of the difference of unit vectors."""
     places = place_points(posed, points, motion)
     start, end = (torch.tensor([bone[side] for bone in _BONES]) for side in (0, 1))
@@ -96,7 +104,7 @@ def direction_term(posed: Posed, points: BodyPoints, motion: Motion, seen: Seen,
     return loss / len(seen.space)
 
 
-def prior(body: Body, posed: Posed, motion: Motion, fps: float, weights: PriorWeights) -> Tensor:
+def prior(body: Body, posed: Posed, motion: FittedMotion, fps: float, weights: PriorWeights) -> Tensor:
     """How unlike people's shapes, poses and motion this is."""
     spread = motion.pose.new_tensor([STIFFNESS[name.split("_")[-1].rstrip("123")] for name in JOINT_NAMES[1:]])
     loss = 0.05 * (motion.pose / spread[:, None]).square().sum((1, 2)).mean()
@@ -137,7 +145,7 @@ def _limits(pose: Float[Tensor, "t 23 3"]) -> Float[Tensor, "t"]:
 
 
 def match_rims(
-    body: Body, motion: Motion, seen: Seen, k: int, outlines: Outlines, searched: Chosen
+    body: Body, motion: FittedMotion, seen: Seen, k: int, outlines: Outlines, searched: Chosen
 ) -> tuple[Chosen, Float[Tensor, "t p"]]:
     """For each point of a mask's outline the vertex on the body's rim that belongs there, and whether any does."""
     with torch.no_grad():
@@ -169,7 +177,7 @@ def match_rims(
 
 def outline_term(
     posed: Posed,
-    motion: Motion,
+    motion: FittedMotion,
     seen: Seen,
     k: int,
     outlines: Outlines,

@@ -20,7 +20,7 @@ from twofold.prepare.fitting.body_landmarks import body_points
 from twofold.prepare.fitting.energy import PriorWeights, direction_term, landmark_term, match_rims, outline_term, prior
 from twofold.prepare.fitting.observations import Evidence, begin, gather
 from twofold.prepare.fitting.outlines import Outlines, trace_outlines
-from twofold.prepare.fitting.parameters import Chosen, Motion, Posed, choose, pose_motion
+from twofold.prepare.fitting.parameters import Chosen, FittedMotion, Posed, choose, pose_motion
 
 WARM_UP = 20
 """Steps over which the rate grows to its full size."""
@@ -66,7 +66,7 @@ def fit(
     config: FitConfig | None = None,
     points_in_space: Float[np.ndarray, "t 33 3"] | None = None,
     watch: Callable[[float], None] | None = None,
-) -> Motion:
+) -> FittedMotion:
     """The body's shape and motion through a clip.
 
     A long clip is fitted window by window, after shape and focal length were found on a part of it, so that memory
@@ -103,7 +103,7 @@ def _fit(
     config: FitConfig,
     points_in_space: Float[np.ndarray, "t 33 3"] | None,
     watch: Callable[[float], None],
-) -> Motion:
+) -> FittedMotion:
     moments = len(evidence[0].track)
     if not np.any([e.track.found for e in evidence]):
         raise TwofoldError("Nobody was found in any image; film one whole person, well lit, and try again.")
@@ -113,7 +113,7 @@ def _fit(
     # The window in which most is seen tells shape and focal length best.
     seen = [sum(float(e[slice(s, s + WINDOW)].track.visibility.sum()) for e in evidence) for s in starts]
     best = starts[int(np.argmax(seen))]
-    parts: list[Motion] = []
+    parts: list[FittedMotion] = []
     first = _window(evidence, points_in_space, slice(best, best + WINDOW + OVERLAP))
     # Distances told apart from translations would be those of one window only.
     known = _fit_window(body, first[0], fps, free_focal, config, first[1], None, lambda done: None).settled(body)
@@ -132,7 +132,7 @@ def _window(
     return [e[times] for e in evidence], None if space is None else space[times]
 
 
-def _joined(parts: Sequence[Motion]) -> Motion:
+def _joined(parts: Sequence[FittedMotion]) -> FittedMotion:
     """Windows one after the other; where two overlap, the one fades into the other."""
     whole = parts[0]
     for part in parts[1:]:
@@ -153,7 +153,7 @@ def _joined(parts: Sequence[Motion]) -> Motion:
     return whole
 
 
-def _on_guess(motion: Motion, guess: Float[Tensor, "t 3 3"]) -> Motion:
+def _on_guess(motion: FittedMotion, guess: Float[Tensor, "t 3 3"]) -> FittedMotion:
     turned = axis_angle_to_matrix(motion.root) @ motion.guess @ guess.transpose(1, 2)
     return replace(motion, guess=guess, root=matrix_to_axis_angle(turned))
 
@@ -165,9 +165,9 @@ def _fit_window(
     free_focal: bool,
     config: FitConfig,
     points_in_space: Float[np.ndarray, "t 33 3"] | None,
-    known: Motion | None,
+    known: FittedMotion | None,
     watch: Callable[[float], None],
-) -> Motion:
+) -> FittedMotion:
     points = body_points(body)
     outlines = [None if e.masks is None else trace_outlines(e.masks) for e in evidence]
     seen = gather(evidence, outlines, points_in_space)
@@ -179,8 +179,8 @@ def _fit_window(
         shared += ("log_distance", "log_focal") if free_focal else ("log_distance",)
     total = sum(config.steps)
 
-    def everything(direction: float, wide: float) -> Callable[[Motion, Posed], Tensor]:
-        def loss(motion: Motion, posed: Posed) -> Tensor:
+    def everything(direction: float, wide: float) -> Callable[[FittedMotion, Posed], Tensor]:
+        def loss(motion: FittedMotion, posed: Posed) -> Tensor:
             terms = landmark_term(posed, points, motion, seen, config.landmark * wide)
             terms = terms + direction * direction_term(posed, points, motion, seen, config.direction)
             return terms + prior(body, posed, motion, fps, config.prior)
@@ -207,7 +207,7 @@ def _fit_window(
         rate = config.rate * 0.5 * (1 - number / rounds) + 0.002
 
         def with_outlines(
-            motion: Motion, posed: Posed, matched: list[_Matched] = matched, width: float = width
+            motion: FittedMotion, posed: Posed, matched: list[_Matched] = matched, width: float = width
         ) -> Tensor:
             loss = base(motion, posed)
             for k, traced, rims, weight in matched:
@@ -222,13 +222,13 @@ def _fit_window(
 
 def _descend(
     body: Body,
-    motion: Motion,
+    motion: FittedMotion,
     changing: tuple[str, ...],
-    loss: Callable[[Motion, Posed], Tensor],
+    loss: Callable[[FittedMotion, Posed], Tensor],
     steps: int,
     rate: float,
     decay: bool = True,
-) -> Motion:
+) -> FittedMotion:
     """Adam on some of the unknowns.
 
     Its first steps move every unknown by the whole rate, however small the slope: along an arm that adds up to half a

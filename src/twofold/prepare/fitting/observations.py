@@ -14,7 +14,7 @@ from twofold.prepare.detections import Track
 from twofold.prepare.fitting.body_landmarks import BodyPoints
 from twofold.prepare.fitting.initialization import first_pose, first_translation
 from twofold.prepare.fitting.outlines import Mask, Outlines
-from twofold.prepare.fitting.parameters import Motion, place_points, pose_motion
+from twofold.prepare.fitting.parameters import FittedMotion, place_points, pose_motion
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _height(track: Track) -> float:
     return max(float(np.median(extents)) * 1.1, 1.0)
 
 
-def begin(body: Body, points: BodyPoints, seen: Seen) -> Motion:
+def begin(body: Body, points: BodyPoints, seen: Seen) -> FittedMotion:
     """A first guess: the mean shape, posed by the landmarks in space, standing where it projects to its landmarks."""
     where = torch.where(seen.space_weight[..., None] > 0, seen.space, torch.nan)
     guesses = [first_pose(points, one) for one in where]
@@ -99,7 +99,7 @@ def begin(body: Body, points: BodyPoints, seen: Seen) -> Motion:
     best = torch.where(torch.stack([known for _, _, known in guesses]), surest, surest - 1e3).argmax(0)
     guess, pose = (torch.stack([g[part] for g in guesses])[best, torch.arange(len(best))] for part in (0, 1))
     moments = len(guess)
-    motion = Motion(
+    motion = FittedMotion(
         guess=guess, root=torch.zeros(moments, 3), pose=pose.float(), translation=torch.zeros(moments, 3),
         betas=torch.zeros(body.shape_basis.shape[-1]), marks=torch.zeros(33, 3), log_focal=torch.zeros(()),
         log_distance=torch.zeros(()),

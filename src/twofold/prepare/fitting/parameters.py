@@ -16,7 +16,7 @@ from twofold.prepare.fitting.body_landmarks import BodyPoints
 
 
 @dataclass(frozen=True)
-class Motion:
+class FittedMotion:
     """A body through a clip; tensors to be optimised.
 
     Attributes:
@@ -43,7 +43,7 @@ class Motion:
     def __len__(self) -> int:
         return len(self.root)
 
-    def __getitem__(self, times: slice) -> "Motion":
+    def __getitem__(self, times: slice) -> "FittedMotion":
         return replace(
             self, guess=self.guess[times], root=self.root[times], pose=self.pose[times],
             translation=self.translation[times],
@@ -54,15 +54,15 @@ class Motion:
         root = matrix_to_axis_angle(axis_angle_to_matrix(self.root) @ self.guess)
         return torch.cat([root[:, None], self.pose], 1)
 
-    def settled(self, body: Body) -> "Motion":
+    def settled(self, body: Body) -> "FittedMotion":
         """The same motion with the distance told by the translations."""
         root = body.joints[0] + body.joint_basis[0, :, : len(self.betas)] @ self.betas
         moved = (root + self.translation) * self.log_distance.exp() - root
         return replace(self, translation=moved, log_distance=torch.zeros_like(self.log_distance))
 
-    def detached(self) -> "Motion":
+    def detached(self) -> "FittedMotion":
         """The same numbers, to start another optimisation from."""
-        return Motion(**{name: value.detach().clone() for name, value in vars(self).items()})
+        return FittedMotion(**{name: value.detach().clone() for name, value in vars(self).items()})
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def choose(body: Body, index: Int[Tensor, "*t n"]) -> Chosen:
     return Chosen(index, body.weights[index])
 
 
-def pose_motion(body: Body, motion: Motion) -> Posed:
+def pose_motion(body: Body, motion: FittedMotion) -> Posed:
     """The body in every frame (pose blend shapes are left out: they are millimetres, the landmarks' error is not)."""
     n = motion.betas.shape[0]
     joints = body.joints + body.joint_basis[..., :n] @ motion.betas
@@ -120,7 +120,7 @@ def pose_motion(body: Body, motion: Motion) -> Posed:
     return Posed(rigid_transform(rotation, shift)[:, None] @ local, vertices)
 
 
-def place_points(posed: Posed, points: BodyPoints, motion: Motion) -> Float[Tensor, "t 33 3"]:
+def place_points(posed: Posed, points: BodyPoints, motion: FittedMotion) -> Float[Tensor, "t 33 3"]:
     """World positions of the landmarks, with what the estimator puts them off by, metres."""
     n = motion.betas.shape[0]
     rest = points.place + points.basis[..., :n] @ motion.betas + motion.marks
@@ -128,7 +128,7 @@ def place_points(posed: Posed, points: BodyPoints, motion: Motion) -> Float[Tens
     return (carried[..., :3, :3] * rest[:, None]).sum(-1) + carried[..., :3, 3]
 
 
-def place_joints(posed: Posed, body: Body, motion: Motion) -> Float[Tensor, "t 24 3"]:
+def place_joints(posed: Posed, body: Body, motion: FittedMotion) -> Float[Tensor, "t 24 3"]:
     """World positions of the joints, metres."""
     n = motion.betas.shape[0]
     joints = body.joints + body.joint_basis[..., :n] @ motion.betas

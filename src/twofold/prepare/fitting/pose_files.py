@@ -13,14 +13,14 @@ from twofold.body.skeleton import Body
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.npz import are_moderate, read_npz
-from twofold.prepare.fitting.parameters import Motion
+from twofold.prepare.fitting.parameters import FittedMotion
 from twofold.prepare.video.frames import ClipInfo
 
 _PLACES = ("translations", "transl", "trans")
 _JOINTS = 24
 
 
-def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], body: Body) -> Motion:
+def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], body: Body) -> FittedMotion:
     """A motion from an npz file with SMPL-like poses.
 
     Args:
@@ -51,7 +51,7 @@ def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], bo
             f"{path} has poses of {frames} images, and the clip has {info.sources}; give one for every image."
         )
     pose = torch.from_numpy(poses.reshape(frames, _JOINTS, 3)).float()
-    motion = Motion(
+    motion = FittedMotion(
         guess=axis_angle_to_matrix(pose[:, 0]), root=torch.zeros(frames, 3), pose=pose[:, 1:],
         translation=torch.from_numpy(places).float(), betas=_betas(arrays, body, path),
         marks=torch.zeros(33, 3), log_focal=torch.zeros(()), log_distance=torch.zeros(()),
@@ -59,7 +59,7 @@ def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], bo
     return motion_at(motion, sources)
 
 
-def motion_at(motion: Motion, sources: Sequence[int]) -> Motion:
+def motion_at(motion: FittedMotion, sources: Sequence[int]) -> FittedMotion:
     """The motion in some frames, by their numbers."""
     chosen = torch.tensor(list(sources))
     return replace(

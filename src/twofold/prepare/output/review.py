@@ -19,7 +19,7 @@ from twofold.images import read_rgb
 from twofold.prepare.detect.scan import Watched, save_picture, spread_out
 from twofold.prepare.fitting.body_landmarks import body_points
 from twofold.prepare.fitting.outlines import open_mask
-from twofold.prepare.fitting.parameters import Motion, Posed, choose, place_points, pose_motion
+from twofold.prepare.fitting.parameters import FittedMotion, Posed, choose, place_points, pose_motion
 from twofold.prepare.output.acceptance import ImageQuality, image_quality
 from twofold.prepare.output.held_objects import SeenBody, see_body, usual_colors
 from twofold.prepare.output.object_tracks import Patch, Sighting, foreign_patches, moving_objects, without
@@ -49,7 +49,7 @@ def compare_with_pictures(
     camera: Camera,
     watched: Watched,
     body: Body,
-    motion: Motion,
+    motion: FittedMotion,
     size: float,
     held_objects: Literal["keep", "remove"],
     alone: bool,

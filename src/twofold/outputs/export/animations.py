@@ -11,20 +11,20 @@ from twofold.body.motion import Motion
 from twofold.capture.types import Capture, spread
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from twofold.outputs.export.bake import Pose
-from twofold.outputs.export.character import Character, Clip, pose_character
+from twofold.outputs.export.character import Animation, Character, pose_character
 from twofold.outputs.export.make import Baked, training_poses
 
 WEIGHED = 60
 """Frames of a motion for which the morph targets' weights are worked out; those between are interpolated."""
 
 
-def capture_clip(baked: Baked, name: str = "capture") -> Clip:
+def capture_clip(baked: Baked, name: str = "capture") -> Animation:
     """The training motion in the capture's world, with the learned corrections of its poses."""
     times = sorted({frame.time for frame in baked.capture.train})
     return _clip(baked, name, training_poses(baked.capture), np.array(times) / baked.capture.fps)
 
 
-def motion_clip(baked: Baked, motion: Motion) -> Clip:
+def motion_clip(baked: Baked, motion: Motion) -> Animation:
     """Any motion of the body as a clip, with the weights that the field gives the morph targets in its poses."""
     poses, translations = motion.poses.float(), motion.translations.float()
     frames = [Pose(pose, place, None) for pose, place in zip(poses, translations, strict=True)]
@@ -32,7 +32,7 @@ def motion_clip(baked: Baked, motion: Motion) -> Clip:
 
 
 @torch.no_grad()
-def _clip(baked: Baked, name: str, frames: Sequence[Pose], times: np.ndarray) -> Clip:
+def _clip(baked: Baked, name: str, frames: Sequence[Pose], times: np.ndarray) -> Animation:
     shape, avatar = baked.shape, baked.avatar
     fitted = {frame.frame_index: row for row, frame in enumerate(shape.frames) if frame.frame_index is not None}
     row_of = [None if frame.frame_index is None else fitted.get(frame.frame_index) for frame in frames]
@@ -56,7 +56,7 @@ def _clip(baked: Baked, name: str, frames: Sequence[Pose], times: np.ndarray) ->
     table = np.stack([weights[index] for index in given])
     between = [np.interp(rows, given, table[:, target]) for target in range(table.shape[1])]
     shown = np.stack(between, 1).astype(np.float32) if between else None
-    return Clip(name, times.astype(np.float32), np.stack(poses), np.stack(places), shown)
+    return Animation(name, times.astype(np.float32), np.stack(poses), np.stack(places), shown)
 
 
 def upright(capture: Capture) -> Float[Tensor, "3 3"]:
@@ -73,19 +73,19 @@ def upright(capture: Capture) -> Float[Tensor, "3 3"]:
     return axis_angle_to_matrix(torch.linalg.cross(start, target) * (torch.pi / 2))
 
 
-def turned(clip: Clip, rotation: Float[Tensor, "3 3"], pelvis: Float[np.ndarray, "3"]) -> Clip:
+def turned(clip: Animation, rotation: Float[Tensor, "3 3"], pelvis: Float[np.ndarray, "3"]) -> Animation:
     """The clip in a world turned by `rotation`; `pelvis` is the root's place in the rest pose."""
     root = axis_angle_to_matrix(torch.from_numpy(clip.poses[:, 0]).float())
     poses = clip.poses.copy()
     poses[:, 0] = matrix_to_axis_angle(rotation @ root).numpy()
     places = (clip.translations + pelvis) @ rotation.numpy().T - pelvis
-    return Clip(clip.name, clip.times, poses, places.astype(clip.translations.dtype), clip.weights)
+    return Animation(clip.name, clip.times, poses, places.astype(clip.translations.dtype), clip.weights)
 
 
-def grounded(clip: Clip, character: Character) -> Clip:
+def grounded(clip: Animation, character: Character) -> Animation:
     """The clip moved so that it starts above the origin and its lowest point is at y = 0."""
     frames = spread(range(len(clip.times)), 24)
     lowest = min(pose_character(character, clip.poses[t], clip.translations[t])[:, 1].min() for t in frames)
     start = clip.translations[0] + character.joints[0]
     moved = clip.translations - np.array([start[0], lowest, start[2]], dtype=clip.translations.dtype)
-    return Clip(clip.name, clip.times, clip.poses, moved, clip.weights)
+    return Animation(clip.name, clip.times, clip.poses, moved, clip.weights)
