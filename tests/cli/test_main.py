@@ -164,7 +164,9 @@ def test_options_keep_their_old_names_beside_the_new(
 ) -> None:
     asked: list[tuple[object, object]] = []
 
-    def measure(avatar: object, capture: object, run: object, most: object, meshes: object, show: object) -> dict:
+    def measure(
+        avatar: object, capture: object, run: object, most: object, meshes: object, show: object, networks: object
+    ) -> dict:  # fmt: skip
         asked.append((most, meshes))
         return {}
 

@@ -225,7 +225,7 @@ def test_rotations_that_were_rounded_are_made_whole(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
-        ("nothing.txt", None, "is missing; give Qualisys"),
+        ("nothing.txt", None, "is missing; .*give Qualisys"),
         ("notes.txt", b"cam1 is left of cam2", "is no calibration that is known here; give Qualisys"),
         ("binary.qca.txt", b"\xff\xfe\x00", "is not text"),
         ("empty.json", b'{"cameras": {}}', "holds no camera"),
