@@ -173,7 +173,7 @@ def test_a_damaged_checkpoint_is_said_to_be_one(trained: Run, tmp_path: Path) ->
     optimizer = make_optimizer(avatar, recipe.training)
 
     def read() -> None:
-        tensors, _ = read_checkpoint(run)
+        tensors, *_ = read_checkpoint(run)
         own = {name[7:]: t for name, t in tensors.items() if name.startswith("avatar.")}
         load_state(avatar, own, run)
         load_optimizer(optimizer, tensors)

@@ -37,6 +37,8 @@ INCOMPLETE = {
     "twofold.field.points.choose_positions": "needs a surface around every part",
     "twofold.field.prefit.distance_pool": "draws points",
     "twofold.field.prefit.fit_distance": "takes minutes",
+    "twofold.field.prefit_cache.cache_file": "names a file of the user's cache",
+    "twofold.field.prefit_cache.fitted_distance": "takes minutes",
     "twofold.sampling.placement.placement": "puts together what others found",
     "twofold.sampling.pruning.miswarped": "needs a posed body and its shells",
     "twofold.sampling.pruning.visible": "`seen_samples` has it",

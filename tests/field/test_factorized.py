@@ -81,7 +81,7 @@ def inputs():
 
 
 def make(config: FactorizedFieldConfig) -> FactorizedField:
-    return off_the_start(config.build(POSE_SIZE, torch.Generator().manual_seed(1)))
+    return off_the_start(config.build(None, POSE_SIZE, torch.Generator().manual_seed(1)))
 
 
 def literal_encoding(x, octaves, include_pi):
@@ -362,7 +362,7 @@ def test_compiles_into_one_graph_with_first_order_training():
         from twofold.field.factorized import FactorizedFieldConfig
         config = FactorizedFieldConfig(width=12, low_octaves=1, high_octaves=1, low_sdf_depth=1, low_color_depth=1,
                                        high_sdf_depth=2, high_skip=1, high_color_depth=1)
-        field = config.build(4, torch.Generator().manual_seed(0))
+        field = config.build(None, 4, torch.Generator().manual_seed(0))
         x, pose, matrix = torch.randn(8, 3), torch.randn(4), torch.randn(8, 3, 3)
         def loss(field, x, pose, matrix):
             out = field(x, pose, matrix)

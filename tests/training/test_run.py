@@ -247,7 +247,7 @@ def test_automatic_device_is_the_gpu_where_there_is_one():
         "training.steps=0", "training.images_per_step=0", "method.rates.low=-1", "training.checkpoint_every=0",
         "training.preview_every=-1", "training.adam_betas=0.9,1.0", "training.clip=-1", "training.steps=many",
         "method.sampler.refined=1", "method.neighbours=0", "method.beta=0", "method.losses.mask=-0.1",
-        "method.shell_refresh=0", "training.steps=1e99", "training.pixels.rays=-1", "training.pixels.rays=0",
+        "method.shell_refresh=0", "training.steps=1e99", "training.pixels.rays=-1",
         "training.pixels.rays=99999999999", "training.pixels.subject_share=3", "training.pixels.patches=-1",
         "training.pixels.patch_size=0", "training.decay=0", "training.decay_from=2", "method.outlier_distance=-1",
         "method.neighbours=999999", "method.pose.drop=7", "method.pose.zero_until=-1", "method.field.width=0",
@@ -260,6 +260,12 @@ def test_settings_with_which_nothing_can_be_trained_are_refused_by_name(setting)
         with_overrides(released(), [setting])
     assert setting.partition("=")[0].rpartition(".")[2] in sentence(error)
     assert len(sentence(error)) < 200
+
+
+def test_without_single_pixels_there_have_to_be_patches():
+    assert with_overrides(released(), ["training.pixels.rays=0"]).training.pixels.patches > 0
+    with pytest.raises(TwofoldError, match="rays=0 and patches=0"):
+        with_overrides(quick(), ["training.pixels.rays=0"])
 
 
 @pytest.mark.parametrize(

@@ -152,7 +152,7 @@ def nearest_to_steps(timed: Iterable[tuple[float, Item]], fps: float | int) -> I
     Yields:
         Step, number of the item, its seconds and the item; of two as near, the first.
 
-    >>> [found[:2] for found in nearest_to_steps([(0.0, "a"), (0.1, "b"), (0.4, "c")], fps=5)]
+    >>> [found[:2] for found in nearest_to_steps([(0.0, "a"), (0.15, "b"), (0.4, "c")], fps=5)]
     [(0, 0), (1, 1), (2, 2)]
     >>> [found[:2] for found in nearest_to_steps([(0.0, "a"), (0.6, "b")], fps=5)]
     [(0, 0), (3, 1)]

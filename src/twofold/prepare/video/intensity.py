@@ -69,9 +69,9 @@ def white_level(files: Sequence[Path]) -> tuple[float, list[str]]:
 def inferred_white(peak: float, floating: bool, where: str) -> tuple[float, list[str]]:
     """The value of white where the largest value is `peak`; see `white_level`.
 
-    >>> inferred_white(65535, False, "x")
+    >>> inferred_white(65535.0, False, "x")
     (65535.0, [])
-    >>> inferred_white(0.9, True, "x")[0], inferred_white(4000, False, "x")[0]
+    >>> inferred_white(0.9, True, "x")[0], inferred_white(4000.0, False, "x")[0]
     (1.0, 4095.0)
     """
     if floating and peak <= _HIGHLIGHTS:
