@@ -41,10 +41,10 @@ def read_key_frames(capture: Capture, times: tuple[int, ...] = ()) -> KeyFrames:
 
     Args:
         capture: among whose training frames they are.
-        times: their moments, front and back; none: by `chosen_frames`.
+        times: their frame indices, front and back; none: by `chosen_frames`.
 
     Raises:
-        TwofoldError: a moment is not among the training frames.
+        TwofoldError: an index is not among the training frames.
     """
     frames = named_frames(capture, times) if times else chosen_frames(capture.train)
     height = max(MIN_SIDE, *(frame.camera.height for frame in frames))
@@ -63,7 +63,7 @@ def read_key_frames(capture: Capture, times: tuple[int, ...] = ()) -> KeyFrames:
 
 
 def named_frames(capture: Capture, times: tuple[int, ...]) -> list[Frame]:
-    """The first training frame of each moment.
+    """The first training frame of each frame index.
 
     Raises:
         TwofoldError: there is none.

@@ -42,7 +42,7 @@ class MonoHumanConfig(MethodConfig):
     skeletal: SkeletalConfig = dataclasses.field(default_factory=released_skeletal)
     rates: SkeletalRates = SkeletalRates(volume=5e-6)
     key_frames: tuple[int, ...] = ()
-    """Moments of the two key frames, front and back; none: chosen by how the body is turned and posed."""
+    """Frame indices of the two key frames, front and back; none: chosen by how the body is turned and posed."""
     features_every: int = 1
     """Steps from one in which the network of the key frames' features learns to the next."""
     consistency: float = 1.0
@@ -51,7 +51,7 @@ class MonoHumanConfig(MethodConfig):
     def __post_init__(self) -> None:
         """Refuses settings that nothing can be made of."""
         require_within(self, key_frames=(0, MOST_STEPS), features_every=(1, MOST_STEPS), consistency=(0, 1e6))
-        require(len(self.key_frames) in (0, 2), f"key_frames should be two moments or none, not {self.key_frames}")
+        require(len(self.key_frames) in (0, 2), f"key_frames should be two frame indices or none, not {self.key_frames}")
 
     def build(self, subject: Subject, seed: int = 0) -> "MonoHumanAvatar":
         """An untrained avatar of a subject."""
