@@ -152,7 +152,7 @@ def test_recipe_has_the_authors_numbers():
 
 
 def test_one_key_frame_is_refused():
-    with pytest.raises(ValueError, match="key_frames should be two moments or none"):
+    with pytest.raises(ValueError, match="key_frames should be two frame indices or none"):
         MonoHumanConfig(key_frames=(3,))
 
 

@@ -51,7 +51,8 @@ class MonoHumanConfig(MethodConfig):
     def __post_init__(self) -> None:
         """Refuses settings that nothing can be made of."""
         require_within(self, key_frames=(0, MOST_STEPS), features_every=(1, MOST_STEPS), consistency=(0, 1e6))
-        require(len(self.key_frames) in (0, 2), f"key_frames should be two frame indices or none, not {self.key_frames}")
+        two = len(self.key_frames) in (0, 2)
+        require(two, f"key_frames should be two frame indices or none, not {self.key_frames}")
 
     def build(self, subject: Subject, seed: int = 0) -> "MonoHumanAvatar":
         """An untrained avatar of a subject."""
