@@ -246,9 +246,10 @@ def train(
 
 @torch.no_grad()
 def _level_on_body(avatar: Avatar, frame: Frame) -> Float[Tensor, "V"]:
-    """The field at the canonical body's vertices, which finite parameters may make infinite all the same."""
+    """The field at the body's vertices, which finite parameters may make infinite all the same."""
     posed = avatar.pose(frame.pose, frame.translation)
-    return avatar.level(posed.body.canonical_vertices, posed)
+    at = posed.body.vertices if avatar.level_space == "posed" else posed.body.canonical_vertices
+    return avatar.level(at, posed)
 
 
 class _Run:
