@@ -113,16 +113,19 @@ def test_rendering_with_a_generator_depends_on_its_seed_alone(avatar, posed, ray
     assert not torch.equal(one, other)
 
 
-def test_rays_that_see_nobody_are_background_and_keep_a_gradient(avatar, posed, rays):
+def test_rays_that_see_nobody_are_background_and_keep_a_gradient(avatar, recipe, posed, rays):
     away = type(rays)(rays.origins, -rays.directions, rays.near, rays.far)
     found = avatar.render(away, posed, BACKGROUND, Mode(5), torch.Generator().manual_seed(0))
     assert (found.base is None) == (avatar.render(rays, posed, BACKGROUND).base is None)
+    # Samples of rays with bounds of a method's own may lie anywhere, where a density is small but not zero.
+    own_bounds = recipe.name in ("vid2avatar", "vid2avatar_mask")
+    allowed = 1e-6 if own_bounds else 0.0
     for part in (found, found.base or found):
-        # Samples of rays with bounds of a method's own may lie anywhere, where a density is small but not zero.
-        torch.testing.assert_close(part.color, BACKGROUND.expand_as(part.color), rtol=0, atol=1e-6)
-        assert part.opacity.max() < 1e-6
+        torch.testing.assert_close(part.color, BACKGROUND.expand_as(part.color), rtol=0, atol=allowed)
+        assert part.opacity.max() <= allowed
     found.color.sum().backward()
-    assert all(p.grad is None or p.grad.abs().max() < 1e-4 for p in avatar.parameters())
+    gradients = [p.grad.abs().max() for p in avatar.parameters() if p.grad is not None]
+    assert all(g < 1e-4 if own_bounds else g == 0 for g in gradients)
     avatar.zero_grad(set_to_none=True)
 
 
