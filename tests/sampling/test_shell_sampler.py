@@ -75,6 +75,15 @@ def test_a_table_belongs_to_one_pose_and_one_state_of_the_field(looking, dense):
     assert changed > 2 * again
 
 
+def test_a_training_step_makes_the_grid_of_before_invalid(looking, dense):
+    """Fused Adam does not count versions of the parameters that it changes."""
+    _, _, posed = looking(0.03)
+    _, again, _ = looking(0.03, posed)
+    dense.before_step(Mode(7))
+    _, after, _ = looking(0.03, posed)
+    assert after > 2 * again
+
+
 def test_few_samples_are_asked_about_one_by_one(looking, monkeypatch):
     monkeypatch.setattr(shell_sampler, "_GRID_PAYS", 10**9)
     assert looking(0.03)[1] == looking(0.0)[1]

@@ -74,6 +74,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         self.register_buffer("canonical_points", canonical.canonical_vertices.clone(), persistent=False)
         if config.late_neighbours is not None:
             self.register_buffer("late_shape", torch.zeros_like(subject.betas))
+        self._steps = 0
         self._shells: dict[int, Shell] = {}
         self._bodies = {torch.device("cpu"): subject.body}
         self._perceptual: tuple[LPIPS, ...] = ()
@@ -118,6 +119,8 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
 
     def before_step(self, mode: Mode) -> None:
         """Lets the shells, and the canonical body that turns normals, follow the corrections from time to time."""
+        # Fused Adam changes parameters without counting versions.
+        self._steps += 1
         epoch, first = self._epoch(mode)
         if self.config.late_neighbours is not None and first and epoch and epoch % self.config.late_from == 0:
             self.late_shape.copy_(self.refinement.shape.detach())
@@ -238,7 +241,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         def distance(x_canonical: Tensor) -> Tensor:
             return self.field.sdf(x_canonical, posed.own.condition)
 
-        version = tuple(parameter._version for parameter in self.field.parameters())
+        version = (self._steps, *(parameter._version for parameter in self.field.parameters()))
         query = FieldQuery(distance, self.beta, self._dense, version)
         placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
         shading = self.config.outliers_in_shading and not mode.training
