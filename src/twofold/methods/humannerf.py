@@ -13,7 +13,7 @@ from twofold.field.nerf import CanonicalNerf, NonRigidMotion
 from twofold.field.output import RadianceOutput
 from twofold.methods.base import MethodConfig, Mode
 from twofold.methods.skeletal import Posed, SkeletalAvatar
-from twofold.methods.skeletal_config import SkeletalConfig, SkeletalRates
+from twofold.methods.skeletal_config import SkeletalConfig, SkeletalRates, affordable
 from twofold.methods.subject import Subject
 from twofold.recipe import PixelConfig, Recipe, TrainingConfig
 
@@ -81,18 +81,7 @@ def humannerf() -> Recipe:
 def humannerf_fast() -> Recipe:
     """The same equations in half an hour on two cores: only likely samples, fewer of them, shortened schedules."""
     start = humannerf()
-    skeletal = dataclasses.replace(
-        start.method.skeletal,
-        samples=64,
-        min_likelihood=0.02,
-        hidden_dtype="auto",
-        volume_every=8,
-        motion_from=300,
-        motion_full=1500,
-        guard_steps=(300, 1000),
-        guard_frames=4,
-        guard_size=64,
-    )
+    skeletal = affordable(start.method.skeletal)
     rates = SkeletalRates(networks=1e-3, volume=5e-5, motion=1e-4, pose=5e-5)
     training = dataclasses.replace(
         start.training,

@@ -20,7 +20,7 @@ from twofold.losses import CONSISTENT_LIKELIHOOD, deformation_consistency
 from twofold.methods.base import EVALUATION, Batch, MethodConfig, Mode, Rendering
 from twofold.methods.key_frames import MIN_SIDE, read_key_frames
 from twofold.methods.skeletal import Posed, SkeletalAvatar, aligned
-from twofold.methods.skeletal_config import MOST_STEPS, SkeletalConfig, SkeletalRates
+from twofold.methods.skeletal_config import MOST_STEPS, SkeletalConfig, SkeletalRates, affordable
 from twofold.methods.subject import Subject
 from twofold.recipe import PixelConfig, Recipe, TrainingConfig
 
@@ -215,18 +215,7 @@ def monohuman() -> Recipe:
 def monohuman_fast() -> Recipe:
     """The same equations within reach of two cores: only likely samples, fewer of them, shortened schedules."""
     start = monohuman()
-    skeletal = replace(
-        start.method.skeletal,
-        samples=64,
-        min_likelihood=0.02,
-        hidden_dtype="auto",
-        volume_every=8,
-        motion_from=300,
-        motion_full=1500,
-        guard_steps=(300, 1000),
-        guard_frames=4,
-        guard_size=64,
-    )
+    skeletal = affordable(start.method.skeletal)
     rates = SkeletalRates(networks=1e-3, volume=5e-6, motion=1e-4, pose=5e-5)
     method = replace(start.method, skeletal=skeletal, rates=rates, features_every=4)
     pixels = PixelConfig(

@@ -1,6 +1,6 @@
 """Settings that HumanNeRF and MonoHuman share, and what both derive from a pose."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from jaxtyping import Float
@@ -123,3 +123,19 @@ class Shaded:
     color: Float[Tensor, "S 3"]
     likelihood: Float[Tensor, "S"]
     extras: dict[str, Tensor]
+
+
+def affordable(config: SkeletalConfig) -> SkeletalConfig:
+    """The same equations within reach of two cores: only likely samples, fewer of them, shortened schedules."""
+    return replace(
+        config,
+        samples=64,
+        min_likelihood=0.02,
+        hidden_dtype="auto",
+        volume_every=8,
+        motion_from=300,
+        motion_full=1500,
+        guard_steps=(300, 1000),
+        guard_frames=4,
+        guard_size=64,
+    )
