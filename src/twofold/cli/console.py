@@ -102,6 +102,11 @@ def say(result: str, following: str) -> None:
     console().print(f"{result} Next: {following}", soft_wrap=True)
 
 
+def tell(note: str) -> None:
+    """A line about what was found or done, between others."""
+    console().print(note, soft_wrap=True)
+
+
 def within(**options: tuple[int | None, int, int | None]) -> None:
     """Refuses options (value, least, most or None for no limit) that are too small or too large.
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from twofold.cli.console import bar, say, within
+from twofold.cli.console import bar, say, tell, within
 from twofold.errors import TwofoldError
 
 if TYPE_CHECKING:
@@ -61,6 +61,7 @@ def export(
     """
     from twofold.capture.folder import read_capture
     from twofold.outputs.export.bake import BakeConfig
+    from twofold.outputs.export.bake_cache import open_cache
     from twofold.outputs.export.options import ExportOptions
     from twofold.outputs.export.write import ExportRequest, require_exportable
     from twofold.outputs.export.write import export as write
@@ -80,7 +81,7 @@ def export(
     require_exportable(request, read)
     folder = out or run / "exports"
     with bar("Exporting") as show:
-        written = write(avatar, read, folder, request, show)
+        written = write(avatar, read, folder, request, show, open_cache(run, read, tell))
     names = ", ".join(path.name for path in written)
     say(f"{names} in {folder}.", "open it in Blender, three.js or a game engine; see docs/export.md")
 

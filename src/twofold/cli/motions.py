@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from twofold.cli.advice import require_capture
-from twofold.cli.console import bar, console, say, within
+from twofold.cli.console import bar, console, say, tell, within
 
 
 @dataclass(frozen=True)
@@ -120,6 +120,7 @@ def render_motion(
         console().print(line, soft_wrap=True)
     cameras = motion_cameras(body, read.motion, size, shown.follow)
     if shown.mesh:
+        from twofold.outputs.export.bake_cache import open_cache
         from twofold.outputs.mesh_motion import mesh_renderer
 
         folder = find_capture(run, capture)
@@ -127,7 +128,8 @@ def render_motion(
         trained_on = read_capture(folder)
         require_same(run, trained_on, motion=True)
         with bar("Baking") as progress:
-            renderer = mesh_renderer(avatar, trained_on, read.motion, progress=progress)
+            cache = open_cache(run, trained_on, tell)
+            renderer = mesh_renderer(avatar, trained_on, read.motion, progress=progress, cache=cache)
     else:
         renderer = field_renderer(avatar, read.motion, chunk)
     with bar("Rendering") as show:

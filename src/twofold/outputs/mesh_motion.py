@@ -10,6 +10,7 @@ from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
 from twofold.outputs.export.animations import motion_clip
 from twofold.outputs.export.bake import BakeConfig
+from twofold.outputs.export.bake_cache import BakeCache
 from twofold.outputs.export.character import Animation, Character, pose_character
 from twofold.outputs.export.make import bake
 from twofold.outputs.mesh_preview import as_tensor, draw_mesh
@@ -25,6 +26,7 @@ def mesh_renderer(
     motion: Motion,
     config: BakeConfig = CONFIG,
     progress: Callable[[float, str], None] = lambda _done, _note: None,
+    cache: BakeCache | None = None,
 ) -> Renderer:
     """Bakes the avatar once, and renders the frames of a motion from the mesh.
 
@@ -34,11 +36,12 @@ def mesh_renderer(
         motion: what it does.
         config: of the mesh.
         progress: called with the fraction that is done and what comes next.
+        cache: of the run that `avatar` was loaded from (`open_cache`).
 
     Raises:
         TwofoldError: see `bake`.
     """
-    baked = bake(avatar, capture, config, progress=lambda done, note: progress(0.9 * done, note))
+    baked = bake(avatar, capture, config, progress=lambda done, note: progress(0.9 * done, note), cache=cache)
     clip = motion_clip(baked, motion)
     progress(1.0, "")
     return clip_renderer(baked.character, clip)

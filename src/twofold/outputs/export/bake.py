@@ -1,7 +1,7 @@
 """From a field to a character: surface, skinning, morph targets, texture."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -75,15 +75,18 @@ class BakedShape:
 
     Attributes:
         skin: the mean surface.
+        extracted: the surface before it took the mean of the frames, rest space, metres.
         targets: morph targets, rest space, metres at weight 1.
         weights: of the targets at the fitted frames.
         frames: those frames.
         errors: of the targets, see `morph_errors`.
         watertight: measured after merging equal positions.
-        shown: some of the frames, with the surface pulled back from each: what colours are averaged over.
+        shown: some of the frames, with the surface pulled back from each: what colours are averaged over. Empty where
+            the shape was stored; see `shown_surfaces`.
     """
 
     skin: Skin
+    extracted: Float[Tensor, "V 3"]
     targets: Float[Tensor, "M V 3"]
     weights: Float[Tensor, "T M"]
     frames: tuple[Pose, ...]
@@ -148,7 +151,16 @@ def bake_shape(
     morphs = fit_morphs(off, known, count)
     moved = Skin(skin.vertices + morphs.mean, canonical, faces, weights, rest)
     errors = morph_errors(off, known, count)
-    return BakedShape(moved, morphs.targets, morphs.weights, chosen, errors, watertight, tuple(shown))
+    return BakedShape(moved, skin.vertices, morphs.targets, morphs.weights, chosen, errors, watertight, tuple(shown))
+
+
+def shown_surfaces(avatar: Avatar, shape: BakedShape, config: BakeConfig) -> tuple[tuple[PosedAvatar, PulledBack], ...]:
+    """The frames that colours are averaged over, with the surface pulled back from each; made again where not kept."""
+    if shape.shown:
+        return shape.shown
+    skin = replace(shape.skin, vertices=shape.extracted)
+    posed = [frame.of(avatar) for frame in spread(shape.frames, config.color_frames)]
+    return tuple((one, pull_back(avatar, one, skin, config.branch)) for one in posed)
 
 
 def _extract(

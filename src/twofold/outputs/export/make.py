@@ -12,7 +12,19 @@ from twofold.capture.types import Capture, Frame, spread
 from twofold.errors import TwofoldError
 from twofold.methods.base import Avatar, PosedAvatar
 from twofold.outputs.export.atlas import Atlas, as_bytes_image, dilated, paint_texture, tangents, unwrap
-from twofold.outputs.export.bake import BakeConfig, BakedShape, Pose, Progress, bake_colors, bake_normals, bake_shape
+from twofold.outputs.export.bake import (
+    BakeConfig,
+    BakedShape,
+    Pose,
+    Progress,
+    bake_colors,
+    bake_normals,
+    bake_shape,
+    rest_body,
+    shown_surfaces,
+)
+from twofold.outputs.export.bake_cache import BakeCache, kept
+from twofold.outputs.export.bake_codecs import Paint, atlas_codec, paint_codec, shape_codec
 from twofold.outputs.export.character import Character, normals_of
 from twofold.outputs.export.lattice import TriangleLattice, build_lattice, segments_for
 from twofold.outputs.export.morphs import PulledBack, pull_back
@@ -77,6 +89,7 @@ def bake(
     color: str | int = "full",
     name: str = "avatar",
     progress: Progress = lambda _done, _note: None,
+    cache: BakeCache | None = None,
 ) -> Baked:
     """The avatar as a rigged, coloured character.
 
@@ -88,24 +101,32 @@ def bake(
             frame's index for the full field in that frame's pose.
         name: of the character.
         progress: called with the fraction that is done and what comes next.
+        cache: of the run that `avatar` was loaded from; what it holds is not baked again.
 
     Raises:
         TwofoldError: there is no such frame, no surface, or a package is missing.
     """
-    one = None if isinstance(color, str) else pose_of(capture, frame_at(capture, color))
-    shape = bake_shape(avatar, training_poses(capture), config, lambda done, note: progress(0.5 * done, note))
-    progress(0.5, "colours")
-    lit = config.lit or not avatar.separates_light
-    shown: Shown = shape.shown
-    if one is not None:
-        posed = one.of(avatar)
-        shown = [(posed, pull_back(avatar, posed, shape.skin, config.branch))]
+    frame = None if isinstance(color, str) else frame_at(capture, color)
+    kind: dict[str, object] = {
+        "faces": config.faces, "branch": config.branch, "targets": config.targets, "frames": config.frames,
+        "color_frames": config.color_frames,
+    }  # fmt: skip
+    shape = kept(
+        cache, "shape", kind, shape_codec(rest_body(avatar)),
+        lambda: bake_shape(avatar, training_poses(capture), config, lambda done, note: progress(0.5 * done, note)),
+    )  # fmt: skip
     vertices, faces = shape.skin.vertices.cpu().numpy(), shape.skin.faces.cpu().numpy()
-    # The lattice is as fine for one pose as a texture shows, and coarser where many poses are averaged.
-    segments = segments_for(len(vertices), len(faces), QUERIES // (2 * len(shown))) if config.texture else 1
-    lattice = build_lattice(len(vertices), faces, segments)
-    branch = "base" if color == "base" or config.branch == "base" else "full"
-    colors = bake_colors(avatar, shown, lattice.interpolate, branch, lit).cpu().numpy()
+    atlas: Atlas | None = None
+    if config.texture:
+        progress(0.5, "atlas")
+        kind["texture"] = config.texture
+        atlas = kept(cache, "atlas", kind, atlas_codec(len(vertices)), lambda: unwrap(vertices, faces, config.texture))
+    progress(0.65, "colours")
+    kind |= {"color": color, "lit": config.lit}
+    paint = kept(
+        cache, "paint", kind, paint_codec(len(vertices)),
+        lambda: _paint(avatar, capture, config, shape, atlas, frame or color, progress),
+    )  # fmt: skip
     character = Character(
         name=name,
         vertices=vertices,
@@ -114,45 +135,76 @@ def bake(
         weights=shape.skin.weights.cpu().numpy(),
         targets=shape.targets.cpu().numpy(),
         clips=(),
-        colors=colors[: len(vertices)],
-        lit=lit,
-        observed=_observed(capture, shape, faces),
+        colors=paint.colors,
+        atlas=atlas,
+        texture=paint.texture,
+        normal_map=paint.normal_map,
+        lit=config.lit or not avatar.separates_light,
+        observed=paint.observed,
     )
-    if config.texture:
-        progress(0.7, "atlas")
-        atlas = unwrap(vertices, faces, config.texture)
-        progress(0.85, "texture")
-        texture, _ = paint_texture(atlas, lattice, colors, config.texture)
-        normals = None
-        if not lit:
-            wanted = bake_normals(avatar, spread(shape.shown, _NORMAL_FRAMES), lattice.interpolate, config.branch)
-            normals = normal_map(character, atlas, lattice, wanted.cpu().numpy(), config.texture)
-        character = replace(character, atlas=atlas, texture=as_bytes_image(texture), normal_map=normals)
     progress(1.0, "")
-    return Baked(avatar, capture, config, shape, character)
+    return Baked(avatar, capture, config, replace(shape, shown=()), character)
 
 
-def _observed(capture: Capture, shape: BakedShape, faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V"]:
-    averaged = spread(shape.frames, len(shape.shown))
-    posed = {frame.frame_index: back.posed for frame, (_, back) in zip(averaged, shape.shown, strict=True)}
+def _paint(
+    avatar: Avatar,
+    capture: Capture,
+    config: BakeConfig,
+    shape: BakedShape,
+    atlas: Atlas | None,
+    color: str | Frame | int,
+    progress: Progress,
+) -> Paint:
+    """Colours of a shape, and with an atlas its texture and normal map; `color` as in `bake`, or a frame."""
+    averaged = shown_surfaces(avatar, shape, config)
+    shown: Shown = averaged
+    if isinstance(color, Frame):
+        posed = pose_of(capture, color).of(avatar)
+        shown = [(posed, pull_back(avatar, posed, shape.skin, config.branch))]
+    vertices, faces = shape.skin.vertices.cpu().numpy(), shape.skin.faces.cpu().numpy()
+    # The lattice is as fine for one pose as a texture shows, and coarser where many poses are averaged.
+    segments = segments_for(len(vertices), len(faces), QUERIES // (2 * len(shown))) if atlas else 1
+    lattice = build_lattice(len(vertices), faces, segments)
+    branch = "base" if color == "base" or config.branch == "base" else "full"
+    lit = config.lit or not avatar.separates_light
+    colors = bake_colors(avatar, shown, lattice.interpolate, branch, lit).cpu().numpy()
+    observed = _observed(capture, shape.frames, averaged, faces)
+    if atlas is None:
+        return Paint(colors[: len(vertices)], observed, None, None)
+    progress(0.85, "texture")
+    texture, _ = paint_texture(atlas, lattice, colors, config.texture)
+    normals = None
+    if not lit:
+        wanted = bake_normals(avatar, spread(averaged, _NORMAL_FRAMES), lattice.interpolate, config.branch)
+        normals = normal_map(vertices, faces, atlas, lattice, wanted.cpu().numpy(), config.texture)
+    return Paint(colors[: len(vertices)], observed, as_bytes_image(texture), normals)
+
+
+def _observed(
+    capture: Capture, frames: Sequence[Pose], averaged: Shown, faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V"]:
+    chosen = spread(frames, len(averaged))
+    posed = {frame.frame_index: back.posed for frame, (_, back) in zip(chosen, averaged, strict=True)}
     views = [(f.camera, posed[f.time].cpu().numpy()) for f in capture.train if f.time in posed]
     return observed_share(faces, views)
 
 
 def normal_map(
-    character: Character, atlas: Atlas, lattice: TriangleLattice, wanted: Float[np.ndarray, "N 3"], size: int
-) -> UInt8[np.ndarray, "h w 3"]:
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], atlas: Atlas, lattice: TriangleLattice,
+    wanted: Float[np.ndarray, "N 3"], size: int,
+) -> UInt8[np.ndarray, "h w 3"]:  # fmt: skip
     """Normals of the rest pose, given at the lattice's nodes, as glTF's tangent-space image.
 
     Args:
-        character: whose vertices have the normals that the image is relative to.
+        vertices: whose normals the image is relative to.
+        faces: triangles.
         atlas: of its mesh.
         lattice: of its mesh.
         wanted: unit normals at the nodes.
         size: edge of the image, texels.
     """
-    own = normals_of(character.vertices, character.faces)
-    frame = np.concatenate([own[atlas.vertex], tangents(atlas, character.vertices, own)], 1)
+    own = normals_of(vertices, faces)
+    frame = np.concatenate([own[atlas.vertex], tangents(atlas, vertices, own)], 1)
     corners = TriangleLattice(1, torch.zeros(0, 3, dtype=torch.long), torch.zeros(0, 3), _corner_table(atlas))
     local, known = paint_texture(atlas, corners, frame, size)
     image, _ = paint_texture(atlas, lattice, wanted, size)

@@ -16,6 +16,7 @@ from twofold.files import plain_errors, write_json
 from twofold.methods.base import Avatar
 from twofold.outputs.export.animations import capture_clip, grounded, motion_clip, turned, upright
 from twofold.outputs.export.bake import BakeConfig, Progress
+from twofold.outputs.export.bake_cache import BakeCache
 from twofold.outputs.export.character import Animation, Character
 from twofold.outputs.export.formats import EXPORTERS
 from twofold.outputs.export.make import Baked, bake, frame_at, still
@@ -90,8 +91,17 @@ def export(
     folder: Path,
     request: ExportRequest,
     progress: Progress = lambda _done, _note: None,
+    cache: BakeCache | None = None,
 ) -> list[Path]:
     """Writes an avatar's files into a folder, and `export.json`, which says what is in them.
+
+    Args:
+        avatar: trained.
+        capture: that it was trained on.
+        folder: for the files.
+        request: what is to be written.
+        progress: called with the fraction that is done and what comes next.
+        cache: of the run that `avatar` was loaded from (`open_cache`).
 
     Raises:
         TwofoldError: see `require_exportable`; the avatar has no surface; the disk refuses.
@@ -103,8 +113,9 @@ def export(
     start = time.monotonic()
     options = request.options
     baked = bake(
-        avatar, capture, request.config, request.color, options.name, lambda done, note: progress(0.85 * done, note)
-    )
+        avatar, capture, request.config, request.color, options.name,
+        lambda done, note: progress(0.85 * done, note), cache,
+    )  # fmt: skip
     seconds = time.monotonic() - start
     character = baked.character
     stem = "avatar" if request.frame is None else f"avatar_{request.frame:04d}"
