@@ -82,7 +82,7 @@ def _encode_shape(shape: BakedShape) -> Arrays:
 
 
 def atlas_codec(vertices: int) -> Codec[Atlas]:
-    """Stores the atlas of a mesh with so many vertices."""
+    """Stores the atlas of a mesh with this number of vertices."""
 
     def decode(arrays: Arrays) -> Atlas:
         corners = len(arrays["vertex"])
@@ -95,7 +95,7 @@ def atlas_codec(vertices: int) -> Codec[Atlas]:
 
 
 def paint_codec(vertices: int) -> Codec[Paint]:
-    """Stores the colours of a mesh with so many vertices."""
+    """Stores the colours of a mesh with this number of vertices."""
 
     def decode(arrays: Arrays) -> Paint:
         require_arrays(arrays, {"colors": (vertices, 3), "observed": (vertices,)})
