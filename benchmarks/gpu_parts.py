@@ -30,7 +30,7 @@ from twofold.kernels.runtime import tune_process
 from twofold.methods.base import Avatar
 from twofold.methods.factorized_recipes import fast, quick
 from twofold.methods.subject import Subject
-from twofold.outputs.views import draw
+from twofold.outputs.views import render_image
 from twofold.recipe import Recipe
 from twofold.training.loop import Progress, train
 from twofold.training.run import load
@@ -91,11 +91,11 @@ def compare(task: Task) -> dict[str, object]:
     for name, recipe in (("quick", few_rays(quick())), ("fast", few_rays(fast()))):
         losses: dict[str, list[float]] = {}
         for device in ("cpu", str(task.device)):
-            told: list[float] = []
+            steps: list[float] = []
             folder = new_place(task, f"compare-{name}-{device.replace(':', '')}-{len(losses)}")
-            watch = watched(lambda p, told=told: told.append(sum(p.losses.values())))
-            train(capture, short(recipe, STEPS), folder, torch.device(device), watch=watch)
-            losses[f"{device} {len(losses)}"] = told
+            on_step = watched(lambda p, steps=steps: steps.append(sum(p.losses.values())))
+            train(capture, short(recipe, STEPS), folder, torch.device(device), progress=on_step)
+            losses[f"{device} {len(losses)}"] = steps
         ours, theirs = losses.values()
         apart = [abs(a - b) / max(abs(a), 1e-9) for a, b in zip(ours, theirs, strict=True)]
         run = task.folder / f"compare-{name}-cpu-0"
@@ -124,7 +124,9 @@ def image(avatar: Avatar, capture: Capture, size: int) -> torch.Tensor:
     camera = frame.camera.resized(size, round(frame.camera.width * size / frame.camera.height))
     with torch.no_grad():
         posed = avatar.pose(frame.pose, frame.translation)
-        return draw(avatar, posed, camera.to(posed.body.vertices.device), torch.tensor(capture.background)).color.cpu()
+        return render_image(
+            avatar, posed, camera.to(posed.body.vertices.device), torch.tensor(capture.background)
+        ).color.cpu()
 
 
 def new_place(task: Task, name: str) -> Path:
@@ -138,10 +140,10 @@ def new_place(task: Task, name: str) -> Path:
 def watched(note: Callable[[Progress], object]) -> Callable[[Progress], None]:
     """A progress callback from a function whatever it returns."""
 
-    def watch(progress: Progress) -> None:
+    def on_step(progress: Progress) -> None:
         note(progress)
 
-    return watch
+    return on_step
 
 
 def trained(task: Task, name: str, recipe: Recipe) -> dict[str, object]:
@@ -150,7 +152,7 @@ def trained(task: Task, name: str, recipe: Recipe) -> dict[str, object]:
     folder = new_place(task, f"train-{name}")
     marks: list[tuple[int, float, float]] = []
 
-    def watch(progress: Progress) -> None:
+    def on_step(progress: Progress) -> None:
         marks.append((progress.step, time.perf_counter(), progress.psnr))
         late = [mark for mark in marks[-2:] if mark[1] - begun > task.seconds]
         if len(late) == 1:  # Once: the loop stores its state after the next step; a second time it would not.
@@ -159,7 +161,7 @@ def trained(task: Task, name: str, recipe: Recipe) -> dict[str, object]:
     begun = time.perf_counter()
     recipe = short(recipe, recipe.training.steps)
     with contextlib.suppress(KeyboardInterrupt):
-        train(capture, recipe, folder, task.device, watch=watch)
+        train(capture, recipe, folder, task.device, progress=on_step)
     if not marks:
         raise RuntimeError("not one step was made")
     # The first steps load kernels and fill caches.

@@ -52,14 +52,16 @@ def train_reference(capture: Capture, small: Capture, seconds: float) -> dict[st
     built: list[Avatar] = []
     steps = 0
 
-    def watch(progress: loop.Progress) -> None:
+    def on_step(progress: loop.Progress) -> None:
         nonlocal steps
         steps = progress.step
         if time.perf_counter() - begun >= seconds:
             raise OutOfTime
 
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(OutOfTime):
-        loop.train(capture, recipe, Path(folder) / "run", torch.device("cpu"), watch=watch, before_first=built.append)
+        loop.train(
+            capture, recipe, Path(folder) / "run", torch.device("cpu"), progress=on_step, before_first=built.append
+        )
     taken = time.perf_counter() - begun
     return {"steps": steps, "rays": pixels.rays, "seconds": taken, "small": figures(built[0].eval(), small, 2)}
 
@@ -85,7 +87,7 @@ def main() -> None:
     measuring = 0.0
     begun = time.perf_counter()
 
-    def watch(progress: loop.Progress) -> None:
+    def on_step(progress: loop.Progress) -> None:
         nonlocal measuring
         if progress.step % every == 0:
             start = time.perf_counter()
@@ -97,7 +99,9 @@ def main() -> None:
             measuring += time.perf_counter() - start
 
     with tempfile.TemporaryDirectory() as folder:
-        loop.train(capture, recipe, Path(folder) / "run", torch.device("cpu"), watch=watch, before_first=built.append)
+        loop.train(
+            capture, recipe, Path(folder) / "run", torch.device("cpu"), progress=on_step, before_first=built.append
+        )
     ours = figures(built[0].eval(), small, 2)
     theirs = train_reference(capture, small, curve[-1]["seconds"])
     store(

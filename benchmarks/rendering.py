@@ -24,7 +24,7 @@ from twofold.methods.base import Avatar
 from twofold.methods.factorized import FactorizedAvatar
 from twofold.methods.factorized_recipes import fast, quick
 from twofold.methods.subject import Subject
-from twofold.outputs.views import draw
+from twofold.outputs.views import render_image
 from twofold.training.loop import train
 
 
@@ -37,7 +37,7 @@ def seconds(avatar: Avatar, capture: Capture, size: int, repeats: int) -> dict[s
 
     def image() -> None:
         with torch.no_grad():
-            draw(avatar, avatar.pose(frame.pose, frame.translation), camera.to(device), background)
+            render_image(avatar, avatar.pose(frame.pose, frame.translation), camera.to(device), background)
 
     return timed(image, repeats)
 

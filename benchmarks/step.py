@@ -58,7 +58,7 @@ def measure(recipe: Recipe, repeats: int, device: torch.device) -> dict[str, obj
         frame = capture.train[0]
         batch = source.draw(0, generator, device).against(background)
         marks = [time.perf_counter()]
-        posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
+        posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
         marks.append(time.perf_counter())
         rendering = avatar.render(batch.rays, posed, background, mode, generator)
         marks.append(time.perf_counter())

@@ -29,8 +29,8 @@ def capture(tmp_path):
     camera = Camera(torch.eye(4), torch.eye(3), 40, 32)
     pose, translation = torch.zeros(24, 3), torch.zeros(3)
     frame = Frame(0, "cam", camera, pose, translation, tmp_path / "image.png", tmp_path / "mask.png")
-    hidden = replace(frame, time=1, ignored_file=tmp_path / "ignored.png")
-    splits = {"train": (frame,), "novel_view": (), "novel_pose": (hidden, replace(frame, time=2))}
+    hidden = replace(frame, frame_index=1, ignored_file=tmp_path / "ignored.png")
+    splits = {"train": (frame,), "novel_view": (), "novel_pose": (hidden, replace(frame, frame_index=2))}
     return Capture("rectangle", tmp_path, little_body(), torch.zeros(0), 10.0, (0.0, 0.0, 0.0), splits)
 
 
@@ -42,7 +42,7 @@ def test_what_is_ignored_spoils_no_figure_and_its_share_is_told(capture, monkeyp
         color, opacity = torch.where(ignored[..., None], 0.3, image), torch.where(ignored, 0.0, mask)
         return RenderedImage(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
 
-    monkeypatch.setattr(evaluate, "draw_frame", drawn)
+    monkeypatch.setattr(evaluate, "render_frame", drawn)
     avatar = refined_avatar(())
     figures = evaluate.measure_split(avatar, capture, "novel_pose")
     assert (figures["psnr"], figures["silhouette_iou"]) == (100, 1)
@@ -64,7 +64,7 @@ def test_what_refined_poses_change_is_told_before_and_after(capture, monkeypatch
         opacity[:14] *= refined
         return RenderedImage(color, opacity, depth=opacity, normal=color, base=color, base_normal=color)
 
-    monkeypatch.setattr(evaluate, "draw_frame", drawn)
+    monkeypatch.setattr(evaluate, "render_frame", drawn)
     figures = evaluate.measure_refinement(refined_avatar(("root", "translation")), capture, 8)
     told = figures.pop("protocol")
     assert told.keys() == figures.keys() > {"root", "body", "translation", "shape"}
@@ -82,7 +82,7 @@ def test_without_refinement_there_is_no_before_and_after(capture, monkeypatch, t
         image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         return RenderedImage(image, mask, depth=mask, normal=image, base=image, base_normal=image)
 
-    monkeypatch.setattr(evaluate, "draw_frame", drawn)
+    monkeypatch.setattr(evaluate, "render_frame", drawn)
     assert "pose_refinement" not in evaluate.evaluate(refined_avatar(()), capture, tmp_path)
     assert "pose_refinement" in evaluate.evaluate(refined_avatar(("root",)), capture, tmp_path)
 
@@ -103,13 +103,15 @@ def test_by_default_a_long_split_is_sampled_evenly_and_the_protocol_says_so(capt
     seen = []
 
     def drawn(avatar, capture, frame, refined):
-        seen.append(frame.time)
+        seen.append(frame.frame_index)
         image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         return RenderedImage(image, mask, depth=mask, normal=image, base=image, base_normal=image)
 
-    monkeypatch.setattr(evaluate, "draw_frame", drawn)
+    monkeypatch.setattr(evaluate, "render_frame", drawn)
     frame = capture.splits["novel_pose"][1]
-    long = replace(capture, splits={**capture.splits, "novel_pose": tuple(replace(frame, time=t) for t in range(300))})
+    long = replace(
+        capture, splits={**capture.splits, "novel_pose": tuple(replace(frame, frame_index=t) for t in range(300))}
+    )
     metrics = evaluate.evaluate(refined_avatar(()), long, tmp_path)
     held_out = seen[:-1]
     assert (len(held_out), held_out[0], held_out[-1]) == (30, 0, 299)
@@ -127,10 +129,10 @@ def exact(avatar, capture, frame, refined):
 
 
 def test_protocols_of_papers_and_a_video_are_measured_where_asked_for(capture, monkeypatch, tmp_path):
-    monkeypatch.setattr(evaluate, "draw_frame", exact)
+    monkeypatch.setattr(evaluate, "render_frame", exact)
     told = []
     metrics = evaluate.evaluate(
-        refined_avatar(()), capture, tmp_path, show=lambda share, what: told.append(share), networks=Networks({})
+        refined_avatar(()), capture, tmp_path, progress=lambda share, what: told.append(share), networks=Networks({})
     )
     table = metrics["novel_pose_protocols"]
     assert table["humannerf_psnr"] == table["instantavatar_psnr"] == 100
@@ -149,7 +151,7 @@ def test_ignored_pixels_spoil_no_protocol(capture, monkeypatch):
         color, opacity = torch.where(ignored[..., None], 0.3, whole.color), torch.where(ignored, 0.0, whole.opacity)
         return replace(whole, color=color, opacity=opacity)
 
-    monkeypatch.setattr(evaluate, "draw_frame", spoilt)
+    monkeypatch.setattr(evaluate, "render_frame", spoilt)
     table = evaluate.measure(refined_avatar(()), capture, networks=Networks({}))["novel_pose_protocols"]
     assert table["instantavatar_psnr"] == table["npc_psnr"] == 100
 
@@ -157,12 +159,14 @@ def test_ignored_pixels_spoil_no_protocol(capture, monkeypatch):
 def test_a_video_is_the_longest_run_of_one_camera_without_gaps(capture):
     frame = capture.splits["train"][0]
     moved = replace(frame.camera, world_to_camera=torch.eye(4) + 0.1)
-    frames = [replace(frame, time=t, camera_name="a") for t in (0, 2, 4, 9, 11, 13, 15)]
-    frames += [replace(frame, time=t, camera_name="b", camera=moved if t > 4 else frame.camera) for t in range(8)]
+    frames = [replace(frame, frame_index=t, camera_name="a") for t in (0, 2, 4, 9, 11, 13, 15)]
+    frames += [
+        replace(frame, frame_index=t, camera_name="b", camera=moved if t > 4 else frame.camera) for t in range(8)
+    ]
     splits = {**capture.splits, "novel_pose": tuple(frames[::-1])}
     chosen = evaluate.steady_video(replace(capture, splits=splits))
     assert {f.camera_name for f in chosen} == {"b"}
-    assert [f.time for f in chosen] == [0, 1, 2, 3, 4]
+    assert [f.frame_index for f in chosen] == [0, 1, 2, 3, 4]
     assert len(evaluate.steady_video(replace(capture, splits=splits), 3)) == 3
     alone = {"train": (frame,), "novel_view": (), "novel_pose": (frame,)}
     assert evaluate.steady_video(replace(capture, splits=alone)) == []

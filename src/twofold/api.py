@@ -18,7 +18,7 @@ from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
 from twofold.methods.table import RECIPES, with_settings
 from twofold.outputs.mesh import posed_surface
-from twofold.outputs.views import RenderedImage, draw
+from twofold.outputs.views import RenderedImage, render_image
 from twofold.training import loop
 from twofold.training.loop import Progress
 from twofold.training.run import choose_device
@@ -55,7 +55,7 @@ def train(
         raise TwofoldError(f"There is no recipe {recipe!r}; there are {', '.join(RECIPES)}.")
     chosen = with_settings(RECIPES[recipe](), [f"seed={seed}", *settings])
     require(validate(capture.folder), capture.folder)
-    return loop.train(capture, chosen, Path(out), choose_device(device), watch=progress)
+    return loop.train(capture, chosen, Path(out), choose_device(device), progress=progress)
 
 
 def load(run: str | Path, device: str = "cpu") -> Avatar:
@@ -92,7 +92,7 @@ def render(
     """
     with torch.no_grad():
         posed = avatar.pose(pose, torch.zeros(3) if translation is None else translation)
-    return draw(avatar, posed, camera, torch.tensor(background))
+    return render_image(avatar, posed, camera, torch.tensor(background))
 
 
 def mesh(

@@ -29,9 +29,9 @@ from twofold.errors import TwofoldError
 from twofold.inputs import shown
 
 T = TypeVar("T")
-MOST_FLOAT = sys.float_info.max
+MAX_FLOAT = sys.float_info.max
 KIND = "kind"
-MOST_SEED = 2**32 - 1
+MAX_SEED = 2**32 - 1
 """Seeds are 0 to this: what every generator takes, and a sine of it still tells neighbours apart."""
 
 
@@ -198,7 +198,7 @@ def _fits(choice: object, data: object) -> bool:
     if choice is types.NoneType:
         return data is None
     if choice is float:
-        return isinstance(data, int | float) and not isinstance(data, bool) and -MOST_FLOAT <= data <= MOST_FLOAT
+        return isinstance(data, int | float) and not isinstance(data, bool) and -MAX_FLOAT <= data <= MAX_FLOAT
     if choice is int:
         return isinstance(data, int) and not isinstance(data, bool)
     if choice is bool:

@@ -18,7 +18,7 @@ from twofold.metrics import video as video_metrics
 from twofold.metrics.protocols import Networks, ProtocolMeans
 from twofold.outputs.mesh import posed_surface
 from twofold.outputs.shares import Shares
-from twofold.outputs.views import RenderedImage, draw
+from twofold.outputs.views import RenderedImage, render_image
 
 NEAR = 0.5
 """Seconds over which the errors of an estimator's poses last."""
@@ -30,10 +30,10 @@ MAX_IMAGES = 30
 """Images a split that are measured unless more are asked for, evenly spread: a minute or two on two cores."""
 
 
-def draw_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) -> RenderedImage:
+def render_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) -> RenderedImage:
     """The avatar in a frame's pose from its camera; `refined` applies what was learned about poses at that time."""
     posed = pose_at(avatar, capture, frame) if refined else avatar.pose(frame.pose, frame.translation, None)
-    return draw(avatar, posed, frame.camera, torch.tensor(capture.background))
+    return render_image(avatar, posed, frame.camera, torch.tensor(capture.background))
 
 
 _REFINED = (
@@ -52,7 +52,7 @@ def pose_at(avatar: Avatar, capture: Capture, frame: Frame) -> PosedAvatar[Any]:
     A training frame has a correction of its own. Another frame between two of these takes theirs, interpolated, if they
     are no more than `NEAR` seconds apart. All others stay as the capture has them.
     """
-    return avatar.pose(*avatar.refined_pose(frame.time, frame.pose, frame.translation, NEAR * capture.fps))
+    return avatar.pose(*avatar.refined_pose(frame.frame_index, frame.pose, frame.translation, NEAR * capture.fps))
 
 
 def sampled(count: int, of: int, what: str) -> str:
@@ -66,7 +66,7 @@ def sampled(count: int, of: int, what: str) -> str:
 
 def measure_split(
     avatar: Avatar, capture: Capture, split: str, most: int | None = None, refined: bool = False,
-    watch: Callable[[Frame, RenderedImage], None] | None = None,
+    progress: Callable[[Frame, RenderedImage], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """Means of all image metrics over a split's frames.
 
@@ -76,12 +76,12 @@ def measure_split(
         split: "train", "novel_view" or "novel_pose".
         most: at most this many frames, evenly spread; None for all.
         refined: apply what training learned about the poses (`pose_at`).
-        watch: called with every frame and its rendering.
+        progress: called with every frame and its rendering.
     """
     rows, shares = [], []
     frames = spread(capture.splits.get(split, ()), most)
     for frame in frames:
-        rendered = draw_frame(avatar, capture, frame, refined)
+        rendered = render_frame(avatar, capture, frame, refined)
         image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         ignored = frame.ignored()
         row = image_metrics.compare(rendered.color, image, rendered.opacity, mask, ignored)
@@ -89,13 +89,13 @@ def measure_split(
             row["base_silhouette_iou"] = image_metrics.silhouette_iou(rendered.base_opacity, mask, ignored=ignored)
         rows.append(row)
         shares.append(ignored[image_metrics.subject_box(mask)].float().mean().item())
-        if watch:
-            watch(frame, rendered)
+        if progress:
+            progress(frame, rendered)
     if not rows:
         return {}
     means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     poses = _REFINED if refined and _refines(avatar) else "as the capture gives them"
-    times = len({frame.time for frame in frames})
+    times = len({frame.frame_index for frame in frames})
     cameras = len({frame.camera_name for frame in frames})
     protocol = {
         **image_metrics.PROTOCOLS,
@@ -112,13 +112,15 @@ def measure_split(
 
 
 def _with_mesh(capture: Capture, most: int | None) -> dict[int, Frame]:
-    moments = {f.time: f for split in ("novel_view", "novel_pose", "train") for f in capture.splits.get(split, ())}
-    return {time: moments[time] for time in spread([t for t in sorted(capture.meshes) if t in moments], most)}
+    by_index = {
+        f.frame_index: f for split in ("novel_view", "novel_pose", "train") for f in capture.splits.get(split, ())
+    }
+    return {time: by_index[time] for time in spread([t for t in sorted(capture.meshes) if t in by_index], most)}
 
 
 def measure_geometry(
     avatar: Avatar, capture: Capture, most: int | None = None, voxel: float = 0.008,
-    watch: Callable[[], None] | None = None,
+    progress: Callable[[], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """Means of the surface metrics over the frames whose true mesh is known; empty where none is."""
     rows = []
@@ -126,8 +128,8 @@ def measure_geometry(
         posed = avatar.pose(frame.pose, frame.translation, None)
         vertices, faces = posed_surface(avatar, posed, voxel)
         rows.append(shape_metrics.compare_surfaces(vertices.cpu(), faces.cpu(), *read_mesh(capture.meshes[time])))
-        if watch:
-            watch()
+        if progress:
+            progress()
     if not rows:
         return {}
     means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
@@ -142,7 +144,7 @@ def measure_geometry(
 
 def measure_refinement(
     avatar: Avatar, capture: Capture, most: int, trained: dict[str, object] | None = None,
-    watch: Callable[[Frame, RenderedImage], None] | None = None,
+    progress: Callable[[Frame, RenderedImage], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """How far training moved the poses, and the same avatar in the poses before and after, in at most `most` images.
 
@@ -157,7 +159,7 @@ def measure_refinement(
     for split, called, known in (("train", "train", trained), ("novel_pose", "held_out", None)):
         for when in poses:
             after = when == "after"
-            metrics = known if known and after else measure_split(avatar, capture, split, most, after, watch)
+            metrics = known if known and after else measure_split(avatar, capture, split, most, after, progress)
             for metric in ("psnr_box", "silhouette_iou") if metrics else ():
                 found[f"{called}_{metric}_{when}"] = metrics[metric]
                 told[f"{called}_{metric}_{when}"] = f"up to {most} images of the split {split} in {poses[when]}"
@@ -176,14 +178,16 @@ def steady_video(capture: Capture, most: int = VIDEO_LENGTH) -> list[Frame]:
     """Successive frames of one camera that stands still: the longest such run of novel poses, else of another split."""
     best: list[Frame] = []
     for split in ("novel_pose", "novel_view", "train"):
-        frames = sorted(capture.splits.get(split, ()), key=lambda f: (f.camera_name, f.time))
+        frames = sorted(capture.splits.get(split, ()), key=lambda f: (f.camera_name, f.frame_index))
         for _, group in groupby(frames, key=lambda f: f.camera_name):
             taken = list(group)
-            step = min((b.time - a.time for a, b in pairwise(taken) if b.time > a.time), default=0)
+            step = min(
+                (b.frame_index - a.frame_index for a, b in pairwise(taken) if b.frame_index > a.frame_index), default=0
+            )
             run = taken[:1]
             for before, now in pairwise(taken):
                 still = torch.equal(before.camera.world_to_camera, now.camera.world_to_camera)
-                run = [*run, now] if now.time - before.time == step and still else [now]
+                run = [*run, now] if now.frame_index - before.frame_index == step and still else [now]
                 if len(run) > max(len(best), 1):
                     best = run
         if best:
@@ -192,29 +196,29 @@ def steady_video(capture: Capture, most: int = VIDEO_LENGTH) -> list[Frame]:
 
 
 def measure_consistency(
-    avatar: Avatar, capture: Capture, most: int = VIDEO_LENGTH, watch: Callable[[], None] | None = None
+    avatar: Avatar, capture: Capture, most: int = VIDEO_LENGTH, progress: Callable[[], None] | None = None
 ) -> dict[str, object]:
     """Figures of the flow between successive frames of `steady_video`; empty where there is no such video."""
     frames = steady_video(capture, most)
 
     def rendered() -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
         for frame in frames:
-            image = draw_frame(avatar, capture, frame, True)
-            if watch:
-                watch()
+            image = render_frame(avatar, capture, frame, True)
+            if progress:
+                progress()
             yield image.color, frame.composited(torch.tensor(capture.background)), frame.mask()
 
     figures: dict[str, object] = dict(video_metrics.frame_consistency(rendered()))
     if not figures:
         return {}
-    seconds = (frames[1].time - frames[0].time) / capture.fps
+    seconds = (frames[1].frame_index - frames[0].frame_index) / capture.fps
     told = f"{len(frames)} successive frames of the camera {frames[0].camera_name}, {seconds:.3g} s apart"
     return figures | {"protocol": {**video_metrics.PROTOCOLS, "frames": told}}
 
 
 def evaluate(
     avatar: Avatar, capture: Capture, folder: Path, most: int | None = MAX_IMAGES, meshes: int | None = 4,
-    show: Callable[[float, str], None] | None = None, extra: dict[str, object] | None = None,
+    progress: Callable[[float, str], None] | None = None, extra: dict[str, object] | None = None,
     networks: Networks | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """`measure` with its metrics written to `metrics.json` in the run's folder.
@@ -225,21 +229,21 @@ def evaluate(
         folder: the run.
         most: at most this many images a split; None for all.
         meshes: at most this many ground-truth meshes.
-        show: progress, with the part that is done and what is being measured.
+        progress: called with the fraction that is done and what is being measured.
         extra: further sections for the file.
         networks: see `measure`.
 
     Raises:
         TwofoldError: an image or mesh is damaged, or the avatar's numbers are not finite.
     """
-    metrics = measure(avatar, capture, most, meshes, show, networks) | (extra or {})
+    metrics = measure(avatar, capture, most, meshes, progress, networks) | (extra or {})
     write_json(folder / "metrics.json", metrics)
     return metrics
 
 
 def measure(
     avatar: Avatar, capture: Capture, most: int | None = MAX_IMAGES, meshes: int | None = 4,
-    show: Callable[[float, str], None] | None = None, networks: Networks | None = None,
+    progress: Callable[[float, str], None] | None = None, networks: Networks | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """Metrics of everything that the capture knows the ground truth of.
 
@@ -248,7 +252,7 @@ def measure(
         capture: with ground truth.
         most: at most this many images a split; None for all.
         meshes: at most this many ground-truth meshes.
-        show: progress, with the part that is done and what is being measured.
+        progress: called with the fraction that is done and what is being measured.
         networks: measures under the settings of several papers as well (`twofold.metrics.protocols`), and the
             consistency of a video, with what networks there are; None leaves both out.
 
@@ -265,9 +269,9 @@ def measure(
     pieces = {**images, "pose refinement": refined, "geometry": len(_with_mesh(capture, meshes))}
     pieces["consistency"] = len(steady_video(capture)) if networks else 0
     section = ""
-    shares = Shares(pieces, {"geometry": _MESH}, lambda share: show(share, section) if show else None)
+    shares = Shares(pieces, {"geometry": _MESH}, lambda share: progress(share, section) if progress else None)
 
-    def watch(what: str) -> None:
+    def count(what: str) -> None:
         nonlocal section
         section = what
         shares.done(what)
@@ -279,23 +283,23 @@ def measure(
         def seen(frame: Frame, image: RenderedImage, split: str = split, means: ProtocolMeans | None = means) -> None:
             if means:
                 add_picture(means, capture, frame, image)
-            watch(split)
+            count(split)
 
         part = measure_split(avatar, capture, split, most, True, seen)
         if part:
             metrics[split] = part
         if means and part:
             metrics[f"{split}_protocols"] = means.figures() | {"protocol": means.protocols()}
-    metrics["train"] = trained = measure_split(avatar, capture, "train", few, True, lambda f, p: watch("train"))
-    geometry = measure_geometry(avatar, capture, meshes, watch=lambda: watch("geometry"))
+    metrics["train"] = trained = measure_split(avatar, capture, "train", few, True, lambda f, p: count("train"))
+    geometry = measure_geometry(avatar, capture, meshes, progress=lambda: count("geometry"))
     if geometry:
         metrics["geometry"] = geometry
-    consistency = measure_consistency(avatar, capture, watch=lambda: watch("consistency")) if networks else {}
+    consistency = measure_consistency(avatar, capture, progress=lambda: count("consistency")) if networks else {}
     if consistency:
         metrics["consistency"] = consistency
     if _refines(avatar):
         metrics["pose_refinement"] = measure_refinement(
-            avatar, capture, few, trained, lambda f, p: watch("pose refinement")
+            avatar, capture, few, trained, lambda f, p: count("pose refinement")
         )
     return metrics
 

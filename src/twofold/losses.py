@@ -28,7 +28,7 @@ CONSISTENT_LIKELIHOOD, CONSISTENT_DISTANCE = 0.3, 0.05
 """Samples that `deformation_consistency` counts: sum of bone weights, and distance in metres."""
 MAX_POINT_OFFSET = 0.04
 """Offsets up to this length cost nothing in `point_offsets`, metres."""
-MOST_STEPS = 10**12
+MAX_STEPS = 10**12
 """More than any training takes; a step of it means never."""
 
 
@@ -74,7 +74,7 @@ class LossConfig:
             raise ValueError("weights should not be negative, reconstruction positive")
         require_within(
             self, reconstruction=(0, 1e6), eikonal=(0, 1e6), common=(0, 1e6), lpips=(0, 1e6), mask=(0, 1e6),
-            base_mask=(0, 1e6), s3im=(0, 1e6), lpips_start=(0, MOST_STEPS), eikonal_points=(1, 1_000_000),
+            base_mask=(0, 1e6), s3im=(0, 1e6), lpips_start=(0, MAX_STEPS), eikonal_points=(1, 1_000_000),
             eikonal_spread=(0, 1), s3im_center=(0, S3IM_WINDOW - 1), lpips_dropout=(0, 0.99),
         )  # fmt: skip
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from twofold.config import MOST_SEED, require_within
+from twofold.config import MAX_SEED, require_within
 
 
 @dataclass(frozen=True)
@@ -96,4 +96,4 @@ class Recipe:
 
     def __post_init__(self) -> None:
         """Refuses seeds that not every generator takes."""
-        require_within(self, seed=(0, MOST_SEED))
+        require_within(self, seed=(0, MAX_SEED))

@@ -31,14 +31,14 @@ def test_a_capture_reads_back_as_it_was_written(tiny):
     poses, translations = tiny_motion()
     for split, cameras in SPLITS.items():
         images = [(camera, time) for camera, times in cameras.items() for time in times]
-        assert [(f.camera_name, f.time) for f in capture.splits[split]] == images
+        assert [(f.camera_name, f.frame_index) for f in capture.splits[split]] == images
         for frame in capture.splits[split]:
-            assert torch.equal(frame.pose, poses[frame.time])
-            assert torch.equal(frame.translation, translations[frame.time])
+            assert torch.equal(frame.pose, poses[frame.frame_index])
+            assert torch.equal(frame.translation, translations[frame.frame_index])
             camera = tiny_cameras()[frame.camera_name]
             assert torch.equal(frame.camera.world_to_camera, camera.world_to_camera)
             assert torch.equal(frame.camera.intrinsics, camera.intrinsics)
-            assert frame.image()[0, 0, 0] * 255 == 30 + frame.time
+            assert frame.image()[0, 0, 0] * 255 == 30 + frame.frame_index
     assert sorted(capture.meshes) == list(range(6))
     with np.load(capture.meshes[3]) as mesh:
         assert mesh["vertices"].shape == (96, 3)
@@ -232,7 +232,7 @@ def test_ignored_pixels_are_written_and_give_way_with_the_rest(tmp_path):
     layer[4:9, 7:11] = 255
     write_tiny(tmp_path / "plain")
     folder = write_tiny(tmp_path / "hidden", ignored={("front", 2): layer})
-    frames = {frame.time: frame for frame in read_capture(folder).train}
+    frames = {frame.frame_index: frame for frame in read_capture(folder).train}
     np.testing.assert_array_equal(frames[2].ignored().numpy(), layer > 0)
     assert frames[1].ignored_file is None
     files = every_file(folder)

@@ -15,7 +15,7 @@ def test_images_leave_every_split_and_the_rest_stays(tmp_path):
     before = json.loads((folder / "capture.json").read_text())
     assert leave_out(folder, [("front", 2), ("back", 4), ("side", 9)]) == [("back", 2), ("back", 4), ("front", 2)]
     capture = read_capture(folder)
-    shown = {split: [(f.camera_name, f.time) for f in frames] for split, frames in capture.splits.items()}
+    shown = {split: [(f.camera_name, f.frame_index) for f in frames] for split, frames in capture.splits.items()}
     assert shown == {
         "train": [("front", 0), ("front", 1), ("front", 3)],
         "novel_view": [("back", 0)],  # The other frame is not trained on any more

@@ -43,7 +43,7 @@ def test_images_are_read_anew_each_time(tiny):
 def test_train_is_the_train_split(tiny):
     capture = read_capture(tiny)
     assert capture.train is capture.splits["train"]
-    assert [frame.time for frame in capture.train] == [0, 1, 2, 3]
+    assert [frame.frame_index for frame in capture.train] == [0, 1, 2, 3]
 
 
 def test_ignored_pixels_are_read_and_none_are_where_there_is_no_file(tiny):

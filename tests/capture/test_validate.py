@@ -245,11 +245,11 @@ def test_joints_stand_where_the_body_is_posed(tiny):
     capture, joints = read_capture(tiny), joint_positions(read_contents(tiny)[0])
     assert joints is not None
     for frame in capture.train:
-        with np.load(capture.meshes[frame.time]) as mesh:
+        with np.load(capture.meshes[frame.frame_index]) as mesh:
             corners = torch.from_numpy(mesh["vertices"]).unflatten(0, (24, 4)).mean(1)
         # Each joint wears a tetrahedron whose middle lies a little behind it.
-        assert (corners - joints[frame.time]).norm(dim=-1).max() < 0.03
-        columns, rows = project(frame.camera, joints[frame.time])[0].unbind(-1)
+        assert (corners - joints[frame.frame_index]).norm(dim=-1).max() < 0.03
+        columns, rows = project(frame.camera, joints[frame.frame_index])[0].unbind(-1)
         assert ((columns > 0) & (columns < WIDTH) & (rows > 0) & (rows < HEIGHT)).all()
 
 

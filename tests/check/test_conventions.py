@@ -157,7 +157,7 @@ def test_a_right_capture_and_a_hopeless_one_are_left_alone(samples, generator):
 def test_a_motion_that_is_early_or_late_is_found(turner_read, turner_points, late):
     poses, translations = motion()
     moved = [t.roll(late, 0) for t in (poses, translations)]
-    frames = [replace(f, pose=moved[0][f.time], translation=moved[1][f.time]) for f in turner_read.train]
+    frames = [replace(f, pose=moved[0][f.frame_index], translation=moved[1][f.frame_index]) for f in turner_read.train]
     found, gain, share = best_shift([sample_of(f, turner_points) for f in frames], *moved)
     assert found == late
     assert (gain > 0.1, share > 0.9) == (late != 0, late != 0)

@@ -123,7 +123,7 @@ def test_splits_are_written_without_what_should_be_left_out(turner, capsys):
     assert code == 0
     assert "left out of the splits" in said
     assert "camera front at 6-8" in said
-    shown = {(f.camera_name, f.time) for frames in read_capture(turner).splits.values() for f in frames}
+    shown = {(f.camera_name, f.frame_index) for frames in read_capture(turner).splits.values() for f in frames}
     assert {("front", 6), ("front", 7), ("front", 8)}.isdisjoint(shown)
     assert "the splits stay as they are" in checked(capsys, turner, "--write-splits")[1]
 
@@ -242,7 +242,7 @@ def test_items_are_spread_from_end_to_end():
 
 def test_progress_ends_at_one(turner):
     seen = []
-    measure_capture(turner, most=4, watch=seen.append)
+    measure_capture(turner, most=4, progress=seen.append)
     assert seen == sorted(seen)
     assert seen[-1] == 1.0
 

@@ -142,14 +142,14 @@ def test_a_body_that_hardly_leaves_the_images_is_not_outside_by_nothing(good):
 def test_places_are_cameras_and_times(good):
     one = next(f for f in good.frames if f.camera == "side")
     changed = replace(good, frames=tuple(replace(f, iou=0.3) if f is one else f for f in good.frames))
-    assert found(changed, "bad frames").where == f"camera side at {one.time}"
+    assert found(changed, "bad frames").where == f"camera side at {one.frame_index}"
 
 
 def test_sides_that_fit_better_exchanged_are_named(good):
     def exchanged(frame):
         return replace(frame, twins=replace(frame.twins, given=0.6, sides=0.9, sides_differ=0.4))
 
-    some = tuple(exchanged(f) if f.time in (3, 4) and f.camera == "front" else f for f in good.frames)
+    some = tuple(exchanged(f) if f.frame_index in (3, 4) and f.camera == "front" else f for f in good.frames)
     finding = found(replace(good, frames=some), "sides")
     assert (finding.level, finding.where) == ("warning", "camera front at 3-4")
     assert found(replace(good, frames=tuple(map(exchanged, good.frames))), "sides").level == "fault"
@@ -186,7 +186,9 @@ def test_one_wrong_camera_is_named(good):
 
 def test_exchanged_images_are_not_bad_frames_again(good):
     few = each(good, 2, iou=0.3)
-    names = tuple((f.camera, f.time, other.time) for f, other in zip(few.frames[:2], few.frames[1::-1], strict=True))
+    names = tuple(
+        (f.camera, f.frame_index, other.frame_index) for f, other in zip(few.frames[:2], few.frames[1::-1], strict=True)
+    )
     told = topics(replace(few, elsewhere=names))
     assert "exchanged images" in told
     assert "bad frames" not in told

@@ -16,7 +16,7 @@ from tiny_person import Run
 
 from twofold.errors import TwofoldError
 from twofold.methods.base import Rendering
-from twofold.outputs.views import draw, orbit, pose_canonically
+from twofold.outputs.views import orbit, pose_canonically, render_image
 from twofold.training.run import load
 
 
@@ -105,7 +105,7 @@ def test_an_image_that_is_not_finite_is_not_shown(trained: Run, monkeypatch: pyt
 
     monkeypatch.setattr(avatar, "render", broken)
     with pytest.raises(TwofoldError, match="not finite"):
-        draw(avatar, posed, camera, torch.zeros(3))
+        render_image(avatar, posed, camera, torch.zeros(3))
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs POSIX limits")

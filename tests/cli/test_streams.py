@@ -78,7 +78,7 @@ def test_progress_and_messages_go_nowhere_when_nobody_reads(monkeypatch: pytest.
     with pytest.raises(SystemExit) as ended:
         main(["train", "nowhere"])
     assert ended.value.code == 2
-    with streams_that_never_fail(), bar("Working") as show:
+    with streams_that_never_fail(), bar("Working") as progress:
         for done in (0.0, 0.5, 1.0):
-            show(done, "")
+            progress(done, "")
         say("The result is here.", "nothing")

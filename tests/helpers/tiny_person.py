@@ -146,5 +146,5 @@ class Run:
 
 def train_tiny(capture: Capture, folder: Path) -> Run:
     told: list[Progress] = []
-    train(capture, tiny_recipe(), folder, torch.device("cpu"), watch=told.append)
+    train(capture, tiny_recipe(), folder, torch.device("cpu"), progress=told.append)
     return Run(folder, capture, tuple(told))

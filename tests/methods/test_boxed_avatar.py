@@ -158,7 +158,7 @@ def test_density_noise_is_added_in_training_only(avatar, posed, rays):
 
 def test_training_frames_have_codes_and_other_poses_their_mean(avatar, person):
     frame = person.train[2]
-    own = avatar.pose(frame.pose, frame.translation, frame.time).own.code
+    own = avatar.pose(frame.pose, frame.translation, frame.frame_index).own.code
     new = avatar.pose(frame.pose, frame.translation, 10_000).own.code
     assert torch.equal(own, avatar.codes[2])
     torch.testing.assert_close(new, avatar.codes.mean(0))
@@ -222,7 +222,7 @@ def test_an_interrupted_training_ends_with_the_same_numbers(name, person, tmp_pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(person, recipe, tmp_path / "parts", torch.device("cpu"), watch=stop)
+        train(person, recipe, tmp_path / "parts", torch.device("cpu"), progress=stop)
     parts = train(person, recipe, tmp_path / "parts", torch.device("cpu"), resume=True)
     for key, tensor in whole.state_dict().items():
         assert torch.equal(tensor, parts.state_dict()[key]), key

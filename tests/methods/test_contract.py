@@ -1,5 +1,8 @@
 """What every avatar promises, held against every recipe; a new method joins by a recipe of its own."""
 
+import copy
+from dataclasses import is_dataclass, replace
+
 import pytest
 import torch
 from little_body import moved_pose
@@ -15,7 +18,7 @@ from twofold.methods.monohuman import MonoHumanAvatar
 from twofold.methods.skeletal import SkeletalAvatar
 from twofold.methods.subject import Subject
 from twofold.methods.table import RECIPES
-from twofold.outputs.views import draw
+from twofold.outputs.views import render_image
 from twofold.sampling.error_bounded import ErrorBoundedSampler
 from twofold.training.pixels import PixelSource
 from twofold.training.run import load_state
@@ -149,7 +152,7 @@ def test_losses_are_finite_and_every_parameter_learns(name, subject, person):
         frame, batch = person.train[which], source.draw(which, generator)
         behind = avatar.background(torch.tensor(person.background), len(batch.rays), generator)
         batch, mode = batch.against(behind), Mode(LATE, LATE // 5)
-        posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
+        posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
         rendering = avatar.render(batch.rays, posed, batch.background, mode, generator)
         terms = avatar.losses(rendering, batch, posed, mode, generator)
         assert "reconstruction" in terms
@@ -203,7 +206,7 @@ def test_the_same_seed_builds_the_same_avatar(recipe, subject):
 
 
 def test_size_of_the_chunks_does_not_change_the_image(avatar, recipe, posed, camera):
-    whole, pieces = (draw(avatar, posed, camera, BACKGROUND, size) for size in (None, 37))
+    whole, pieces = (render_image(avatar, posed, camera, BACKGROUND, size) for size in (None, 37))
     # As released, the error-bounded sampler goes on until all rays of a call are well enough known; depths of rays that
     # see next to nothing tell that most.
     shell = not isinstance(getattr(recipe.method, "sampler", None), ErrorBoundedSampler)
@@ -213,20 +216,38 @@ def test_size_of_the_chunks_does_not_change_the_image(avatar, recipe, posed, cam
 
 
 def change_by_moving(avatar, person, camera, turn: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-    """What changes in an image when camera and body are turned and shifted together."""
-    frame = person.train[1]
-    pelvis = (person.body.joints + person.body.joint_basis @ person.betas)[0]
+    """What changes in an image when camera and body are turned and shifted together, computed in the type of `turn`."""
+    frame, dtype = in_type(person.train[1], turn.dtype), turn.dtype
+    camera, background = in_type(camera, dtype), BACKGROUND.to(dtype)
+    pelvis = (person.body.joints + person.body.joint_basis @ person.betas)[0].to(dtype)
     pose, translation = moved_pose(frame.pose, frame.translation, pelvis, turn, shift)
     world = rigid_transform(axis_angle_to_matrix(turn), shift)
     moved_camera = Camera(camera.world_to_camera @ rigid_inverse(world), camera.intrinsics, camera.height, camera.width)
-    still = draw(avatar, avatar.pose(frame.pose, frame.translation), camera, BACKGROUND)
-    moved = draw(avatar, avatar.pose(pose, translation), moved_camera, BACKGROUND)
+    still = render_image(avatar, avatar.pose(frame.pose, frame.translation), camera, background)
+    moved = render_image(avatar, avatar.pose(pose, translation), moved_camera, background)
     assert still.opacity.mean() > 0.1
     return (moved.color - still.color).abs()
 
 
+def in_type(record, dtype):
+    """A dataclass with its floating-point tensors, and those of the dataclasses in it, in another type."""
+    values = {}
+    for name, value in vars(record).items():
+        if isinstance(value, torch.Tensor) and value.is_floating_point():
+            values[name] = value.to(dtype)
+        elif is_dataclass(value):
+            values[name] = in_type(value, dtype)
+    return replace(record, **values)
+
+
 def test_shifting_camera_and_body_together_changes_no_pixel(avatar, person, camera):
-    change = change_by_moving(avatar, person, camera, torch.zeros(3), torch.tensor([0.5, -1.0, 0.25]))
+    # Bone boxes have hard edges: in single precision rounding alone moves samples in and out of them.
+    dtype = torch.float64 if isinstance(avatar, BoxedAvatar) else torch.float32
+    if dtype == torch.float64:
+        avatar = copy.deepcopy(avatar).double()
+        avatar.subject = in_type(avatar.subject, dtype)
+    shift = torch.tensor([0.5, -1.0, 0.25], dtype=dtype)
+    change = change_by_moving(avatar, person, camera, torch.zeros(3, dtype=dtype), shift)
     assert change.max() < 1e-4
 
 

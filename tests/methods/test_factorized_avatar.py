@@ -9,7 +9,7 @@ from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods.base import EVALUATION, Mode
 from twofold.methods.subject import Subject
 from twofold.metrics.perceptual import LPIPS
-from twofold.outputs.views import draw
+from twofold.outputs.views import render_image
 from twofold.sampling.error_bounded import ErrorBoundedSampler
 from twofold.sampling.shell_sampler import ShellSampler
 from twofold.training.pixels import PixelSource
@@ -66,7 +66,7 @@ def test_poses_are_corrected_from_the_given_step_on_and_only_in_training_frames(
     avatar = replace(QUICK, pose=replace(QUICK.pose, refine_from=5)).build(subject)
     with torch.no_grad():
         avatar.refinement.translation[1] = torch.tensor([0.1, 0.0, 0.0])
-    plain, time = pose_of(avatar, person), person.train[1].time
+    plain, time = pose_of(avatar, person), person.train[1].frame_index
     moved = pose_of(avatar, person, time=time, step=5)
     torch.testing.assert_close(moved.body.joints - plain.body.joints, torch.tensor([0.1, 0, 0]).expand(24, 3))
     assert moved.own.surface.forward.requires_grad
@@ -85,7 +85,7 @@ def test_only_the_parts_to_be_refined_learn(subject, person, parts):
 
 def test_shells_follow_corrections_only_at_a_refresh_and_then_with_the_shape(subject, person):
     avatar = replace(QUICK, shell_refresh=10).build(subject)
-    time = person.train[1].time
+    time = person.train[1].frame_index
     before = pose_of(avatar, person, time=time, step=8).own.surface.shell
     with torch.no_grad():
         avatar.refinement.translation += 0.2
@@ -111,7 +111,7 @@ def trained_with(trained, **options):
 
 def images(avatar, person):
     frame = person.splits["novel_view"][0]
-    return draw(avatar, avatar.pose(frame.pose, frame.translation), frame.camera.resized(32, 32), BLACK)
+    return render_image(avatar, avatar.pose(frame.pose, frame.translation), frame.camera.resized(32, 32), BLACK)
 
 
 def test_error_bounded_and_shell_sampler_draw_the_same_image(trained, person):
@@ -194,7 +194,7 @@ def losses_of(recipe, avatar, person, step):
     generator = torch.Generator().manual_seed(0)
     frame, batch = person.train[1], source.draw(1, generator)
     batch, mode = batch.against(torch.tensor(person.background)), Mode(step, step // 5)
-    posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
+    posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
     rendering = avatar.render(batch.rays, posed, batch.background, mode, generator)
     return avatar.losses(rendering, batch, posed, mode, generator)
 

@@ -72,7 +72,7 @@ def test_interrupted_training_resumes_to_the_same_numbers(person, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(person, recipe, tmp_path / "parts", cpu, watch=interrupt)
+        train(person, recipe, tmp_path / "parts", cpu, progress=interrupt)
     train(person, recipe, tmp_path / "parts", cpu, resume=True)
     whole, parts = (read_checkpoint(tmp_path / name)[0] for name in ("whole", "parts"))
     assert set(whole) == set(parts)

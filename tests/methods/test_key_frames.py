@@ -52,7 +52,7 @@ def test_frames_that_come_closest_stand_in_where_no_back_is_shown(person):
 def test_images_are_on_black_and_large_enough(person):
     keys = read_key_frames(person, (0, 3))
     assert keys.images.shape == (2, 3, 64, 64)
-    frame = next(f for f in person.train if f.time == 3)
+    frame = next(f for f in person.train if f.frame_index == 3)
     expected = (255 * frame.image() * frame.mask()[..., None]).permute(2, 0, 1)
     assert (keys.images[1, :, :48, :48] - expected).abs().max() <= 0.51
     assert not keys.images[:, :, 48:].any()

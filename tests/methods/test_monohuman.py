@@ -83,7 +83,7 @@ def sent(avatar, volume, x, frame, bands):
 @pytest.mark.slow
 def test_radiance_is_the_equations_point_by_point(avatar, person, points):
     frame, keys = person.train[1], named_frames(person, (0, 3))
-    posed = avatar.pose(frame.pose, frame.translation, frame.time, Mode(STEP))
+    posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, Mode(STEP))
     bands = 6 * (STEP - 5000) / 45_000
     moved = SkeletalPoints(torch.arange(len(points)), points, torch.linspace(0, 1, len(points)))
     with torch.no_grad():
@@ -127,7 +127,7 @@ def test_radiance_is_the_equations_point_by_point(avatar, person, points):
 
 def test_motion_sees_the_pose_from_the_first_step(avatar, person):
     frame = person.train[1]
-    own = avatar.pose(frame.pose, frame.translation, frame.time, Mode(0)).own
+    own = avatar.pose(frame.pose, frame.translation, frame.frame_index, Mode(0)).own
     assert own.condition.any()
     assert own.open_bands == 0
 
@@ -179,7 +179,7 @@ def test_interrupted_training_resumes_to_the_same_numbers_with_its_key_frames(pe
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(person, small(), tmp_path / "parts", cpu, watch=interrupt)
+        train(person, small(), tmp_path / "parts", cpu, progress=interrupt)
     train(person, small(), tmp_path / "parts", cpu, resume=True)
     whole, parts = (read_checkpoint(tmp_path / name)[0] for name in ("whole", "parts"))
     assert whole["avatar.key_images"].any()

@@ -16,7 +16,7 @@ from twofold.methods.npc import npc
 from twofold.methods.point_networks import surface_positions
 from twofold.methods.subject import Subject
 from twofold.outputs.mesh import posed_surface
-from twofold.outputs.views import draw
+from twofold.outputs.views import render_image
 from twofold.training.loop import train
 from twofold.training.pixels import PixelSource
 from twofold.training.run import load_state
@@ -145,7 +145,7 @@ def test_the_second_stage_keeps_the_promises_of_rendering(avatar, posed, rays, c
     assert lit.opacity.min() >= 0
     assert 0.3 < lit.opacity.max() <= 1 + 1e-5
     torch.testing.assert_close(lit.color - dark.color, (1 - dark.opacity)[:, None] * BACKGROUND, rtol=0, atol=1e-5)
-    whole, pieces = (draw(avatar, posed, camera, BACKGROUND, size) for size in (None, 37))
+    whole, pieces = (render_image(avatar, posed, camera, BACKGROUND, size) for size in (None, 37))
     torch.testing.assert_close(pieces.color, whole.color, rtol=0, atol=2e-5)
     away = avatar.render(type(rays)(rays.origins, -rays.directions, rays.near, rays.far), posed, BACKGROUND)
     assert torch.equal(away.color, BACKGROUND.expand_as(away.color))
@@ -173,7 +173,7 @@ def test_everything_learns_in_the_second_stage(subject, person):
         generator = torch.Generator().manual_seed(which)
         frame, batch = person.train[which], source.draw(which, generator)
         batch, mode = batch.against(avatar.background(BACKGROUND, len(batch.rays), generator)), Mode(5)
-        posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
+        posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
         rendering = avatar.render(batch.rays, posed, batch.background, mode, generator)
         terms = avatar.losses(rendering, batch, posed, mode, generator)
         assert {"reconstruction", "coarse", "offsets", "eikonal", "neighbours", "surface", "background"} == set(terms)
@@ -226,7 +226,7 @@ def test_terms_of_the_points_are_those_of_their_formulas(avatar, posed, person):
 def test_pixels_of_training_rays_are_found_again(avatar, person):
     frame = person.train[2]
     grid = pixel_grid(frame.camera).flatten(0, 1)[::97]
-    found = avatar._pixels(pixel_rays(frame.camera, grid), frame.time)
+    found = avatar._pixels(pixel_rays(frame.camera, grid), frame.frame_index)
     size = torch.tensor([frame.camera.width, frame.camera.height])
     torch.testing.assert_close(found, grid / size, rtol=0, atol=1e-4)
 
@@ -257,7 +257,7 @@ def test_either_stage_resumes_to_the_same_numbers(stop_at, person, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(person, recipe, tmp_path / "parts", cpu, watch=stop, before_first=dense)
+        train(person, recipe, tmp_path / "parts", cpu, progress=stop, before_first=dense)
     parts = train(person, recipe, tmp_path / "parts", cpu, resume=True)
     assert whole.points is not None
     for key, tensor in whole.state_dict().items():

@@ -53,7 +53,7 @@ def at(step):
 def in_training(avatar, person, step):
     frame = person.train[1]
     with torch.no_grad():
-        return avatar.pose(frame.pose, frame.translation, frame.time, at(step))
+        return avatar.pose(frame.pose, frame.translation, frame.frame_index, at(step))
 
 
 def scene_matrices(avatar, person):
@@ -61,7 +61,7 @@ def scene_matrices(avatar, person):
     shape; and its posed vertices."""
     frame, refinement = person.train[1], avatar.refinement
     with torch.no_grad():
-        pose, translation = refinement(frame.time, frame.pose, frame.translation)
+        pose, translation = refinement(frame.frame_index, frame.pose, frame.translation)
         given = shape_body(person.body, person.betas)
         shaped = shape_body(person.body, person.betas + refinement.shape)
         bones = joint_transforms(shaped.joints, pose, torch.zeros(3)).clone()
@@ -113,7 +113,7 @@ def test_neighbours_are_one_in_tests_and_before_the_first_validation(avatar, per
     frame = person.train[1]
     assert [in_training(avatar, person, step).own.surface.neighbours for step in (0, 299, 300, 5000)] == [1, 1, 7, 7]
     assert avatar.pose(frame.pose, frame.translation).own.surface.neighbours == 1
-    assert avatar.pose(frame.pose, frame.translation, frame.time).own.surface.neighbours == 1
+    assert avatar.pose(frame.pose, frame.translation, frame.frame_index).own.surface.neighbours == 1
 
 
 def test_canonical_vertices_of_normals_follow_the_shape_at_each_validation_and_are_stored(subject, person):
@@ -142,7 +142,7 @@ def test_tests_have_the_shape_as_given_and_training_frames_the_corrected_one(ava
     given = pose_body(shape_body(person.body, person.betas), frame.pose, frame.translation)
     with torch.no_grad():
         torch.testing.assert_close(avatar.pose(frame.pose, frame.translation).body.vertices, given.vertices)
-        moved = avatar.pose(frame.pose, frame.translation, frame.time).body.vertices
+        moved = avatar.pose(frame.pose, frame.translation, frame.frame_index).body.vertices
     _, vertices, _ = scene_matrices(avatar, person)
     torch.testing.assert_close(moved.double(), vertices / SCALE, atol=1e-5, rtol=0)
 

@@ -172,7 +172,7 @@ def test_losses_are_means_over_patch_images_and_single_rays(avatar, person):
     batch = PixelSource(person.train, person.body, person.betas, pixels).draw(0, torch.Generator().manual_seed(0))
     batch = batch.against(BACKGROUND)
     frame = person.train[0]
-    posed = avatar.pose(frame.pose, frame.translation, frame.time, Mode(GONE))
+    posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, Mode(GONE))
     with torch.no_grad():
         rendering = avatar.render(batch.rays, posed, batch.background, Mode(GONE), torch.Generator().manual_seed(0))
     errors = [float(e) for e in (rendering.color - batch.color)[:5].square().flatten()]
@@ -198,7 +198,7 @@ def test_losses_are_means_over_patch_images_and_single_rays(avatar, person):
 def test_motion_sees_nothing_before_it_begins_and_all_in_the_end(avatar, person):
     frame, config = person.train[1], avatar.settings
     for step, bands in ((0, 0.0), (config.motion_from - 1, 0.0), (30_000, 3.0), (config.motion_full, 6.0)):
-        own = avatar.pose(frame.pose, frame.translation, frame.time, Mode(step)).own
+        own = avatar.pose(frame.pose, frame.translation, frame.frame_index, Mode(step)).own
         assert own.open_bands == pytest.approx(bands)
         assert bool(own.condition.any()) == (step >= config.motion_from)
 
@@ -286,7 +286,7 @@ def test_losses_reach_volume_motion_and_poses(subject, person):
     batch = PixelSource(person.train, person.body, person.betas, RECIPE.training.pixels).draw(
         1, torch.Generator().manual_seed(0)
     )
-    posed = avatar.pose(frame.pose, frame.translation, frame.time, Mode(GONE + 10_000))
+    posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, Mode(GONE + 10_000))
     rendering = avatar.render(batch.rays, posed, BACKGROUND, Mode(GONE), torch.Generator().manual_seed(0))
     total(avatar.losses(rendering, batch.against(BACKGROUND), posed, EVALUATION, torch.Generator())).backward()
     for group in avatar.parameter_groups():

@@ -38,7 +38,7 @@ def room(person, tmp_path_factory):
     for frame in person.train:
         mask = frame.mask().numpy()[..., None]
         image = frame.image().numpy() * mask + random.random((*mask.shape[:2], 3)) * (1 - mask)
-        file = folder / f"{frame.time}.png"
+        file = folder / f"{frame.frame_index}.png"
         Image.fromarray((255 * image).round().astype(np.uint8)).save(file)
         frames.append(replace(frame, image_file=file))
     return replace(person, splits={**person.splits, "train": tuple(frames)})
@@ -108,10 +108,10 @@ def literal_scene(avatar, rays, middle, row):
 def test_scene_is_what_turned_sphere_points_add_up_to(center, subject, person, rays):
     method = replace(WHOLE.method, center=center)
     avatar, frame = solid(replace(WHOLE, method=method), subject), person.train[1]
-    posed = avatar.pose(frame.pose, frame.translation, frame.time)
+    posed = avatar.pose(frame.pose, frame.translation, frame.frame_index)
     low, high = posed.body.vertices.amin(0), posed.body.vertices.amax(0)
     middle = (low + high) / 2 if center == "body" else subject.translations.mean(0) + subject.body.joints[0]
-    expected = literal_scene(avatar, rays, middle, subject.times.tolist().index(frame.time))
+    expected = literal_scene(avatar, rays, middle, subject.times.tolist().index(frame.frame_index))
     torch.testing.assert_close(avatar.scene_color(rays, posed), expected, rtol=0, atol=2e-5)
 
 
@@ -124,7 +124,7 @@ def test_scene_is_what_turned_sphere_points_add_up_to(center, subject, person, r
 def test_pixels_are_the_printed_sum_over_samples(recipe, training, subject, person, rays):
     avatar, frame = solid(recipe, subject), person.train[1]
     mode, seed = (Mode(900, 61), 5) if training else (EVALUATION, None)
-    posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
+    posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
     color = None if avatar.scene is not None else torch.tensor([0.2, 0.9, 0.4])
     rays = without_tiny_components(rays)  # as the program has them where rays begin at a box
     with torch.no_grad():
@@ -182,7 +182,7 @@ def test_losses_are_the_listed_terms(subject, room):
     avatar, frame = solid(WHOLE, subject), room.train[1]
     source = PixelSource(room.train, room.body, room.betas, WHOLE.training.pixels)
     batch, mode = source.draw(1, torch.Generator().manual_seed(0)), Mode(610, 122)
-    posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
+    posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
     generator = torch.Generator().manual_seed(1)
     found = avatar.render(batch.rays, posed, None, mode, generator)
     terms = avatar.losses(found, batch, posed, mode, torch.Generator().manual_seed(2))
@@ -219,7 +219,7 @@ def test_with_masks_the_terms_are_colour_eikonal_and_mask(subject, person):
     source = PixelSource(person.train, person.body, person.betas, MASKED.training.pixels)
     color, mode = torch.tensor(person.background), Mode(0)
     batch = source.draw(1, torch.Generator().manual_seed(0)).against(color)
-    posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
+    posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
     found = avatar.render(batch.rays, posed, color, mode, torch.Generator().manual_seed(0))
     terms = avatar.losses(found, batch, posed, mode, torch.Generator().manual_seed(0))
     assert set(terms) == {"reconstruction", "eikonal", "mask"}
@@ -250,13 +250,13 @@ def test_an_interrupted_training_continues_to_the_same_numbers(name, room, tmp_p
     class Stop(Exception):
         """Stands for whatever ends a run between two checkpoints."""
 
-    def watch(progress):
+    def on_step(progress):
         if progress.step == 7:
             raise Stop
 
     whole = train(room, recipe, tmp_path / "whole", CPU)
     with pytest.raises(Stop):
-        train(room, recipe, tmp_path / "cut", CPU, watch=watch)
+        train(room, recipe, tmp_path / "cut", CPU, progress=on_step)
     train(room, recipe, tmp_path / "cut", CPU, resume=True)
     first, second = (read_checkpoint(tmp_path / run)[0] for run in ("whole", "cut"))
     assert first.keys() == second.keys()
@@ -266,7 +266,7 @@ def test_an_interrupted_training_continues_to_the_same_numbers(name, room, tmp_p
     again, steps = load(tmp_path / "whole")
     assert steps == 9
     frame = room.train[0]
-    vertices, _ = posed_surface(again, again.pose(frame.pose, frame.translation, frame.time), 0.03)
+    vertices, _ = posed_surface(again, again.pose(frame.pose, frame.translation, frame.frame_index), 0.03)
     assert len(vertices) > 100
 
 

@@ -9,7 +9,7 @@ from twofold.capture.folder import read_capture
 from twofold.outputs.export.bake import BakeConfig
 from twofold.outputs.export.character import Animation, pose_character
 from twofold.outputs.mesh_motion import clip_renderer, mesh_renderer
-from twofold.outputs.mesh_preview import draw_mesh
+from twofold.outputs.mesh_preview import render_mesh
 from twofold.outputs.motion_cameras import motion_cameras
 from twofold.outputs.motion_video import field_renderer, rest_body
 from twofold.training.run import load
@@ -26,7 +26,7 @@ def test_a_frame_is_the_posed_and_morphed_character():
 
     view = clip_renderer(character, clip)(2, camera())
     vertices = pose_character(character, poses[2], places[2], weights[2])
-    expected = draw_mesh(character, vertices, camera(), np.zeros(3, np.float32))
+    expected = render_mesh(character, vertices, camera(), np.zeros(3, np.float32))
     assert np.array_equal(view.color.numpy(), expected[..., :3])
     assert np.array_equal(view.opacity.numpy(), expected[..., 3])
     white = torch.ones(3)

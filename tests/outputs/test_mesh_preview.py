@@ -8,7 +8,7 @@ from characters import small_character
 from twofold.geometry.cameras import Camera
 from twofold.geometry.raster import box_filter, rasterize, supersampled
 from twofold.outputs.export.character import Character
-from twofold.outputs.mesh_preview import draw_mesh
+from twofold.outputs.mesh_preview import render_mesh
 from twofold.outputs.views import look_at
 
 BACKGROUND = np.array([0.2, 0.4, 0.9], np.float32)
@@ -32,7 +32,7 @@ def slow(character: Character, view: Camera, samples: int) -> tuple[torch.Tensor
 @pytest.mark.parametrize("samples", [1, 2, 3])
 def test_image_is_that_of_the_slow_rasterizer(samples: int) -> None:
     character = small_character(texture=0)
-    found = draw_mesh(character, character.vertices, camera(), BACKGROUND, samples)
+    found = render_mesh(character, character.vertices, camera(), BACKGROUND, samples)
     color, opacity = slow(character, camera(), samples)
     differs = (np.abs(found[..., :3] - color.numpy()).max(-1) > 2e-3) | (np.abs(found[..., 3] - opacity.numpy()) > 1e-3)
     assert differs.mean() < 2e-3  # pixel centres that lie on an edge, by rounding
@@ -42,14 +42,14 @@ def test_image_is_that_of_the_slow_rasterizer(samples: int) -> None:
 def test_texture_shows_what_the_vertices_have() -> None:
     plain = small_character(texture=0)
     textured = small_character(texture=512)
-    images = [draw_mesh(c, c.vertices, camera(), BACKGROUND) for c in (plain, textured)]
+    images = [render_mesh(c, c.vertices, camera(), BACKGROUND) for c in (plain, textured)]
     assert np.abs(images[0] - images[1]).mean() < 0.01
 
 
 def test_headlight_darkens_what_turns_away() -> None:
     character = small_character(texture=0)
     plain, shaded = (
-        draw_mesh(character, character.vertices, camera(), BACKGROUND, 2, light) for light in (False, True)
+        render_mesh(character, character.vertices, camera(), BACKGROUND, 2, light) for light in (False, True)
     )
     inside = plain[..., 3] == 1
     assert (shaded[inside][:, :3] <= plain[inside][:, :3] + 1e-5).all()
@@ -58,6 +58,6 @@ def test_headlight_darkens_what_turns_away() -> None:
 
 def test_mesh_behind_the_camera_is_not_seen() -> None:
     character = small_character(texture=0)
-    image = draw_mesh(character, character.vertices + np.array([0, 0, 9], np.float32), camera(), BACKGROUND)
+    image = render_mesh(character, character.vertices + np.array([0, 0, 9], np.float32), camera(), BACKGROUND)
     assert (image[..., 3] == 0).all()
     assert np.abs(image[..., :3] - BACKGROUND).max() < 1e-6

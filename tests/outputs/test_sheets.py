@@ -6,7 +6,7 @@ import torch
 
 from twofold.geometry.cameras import Camera
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_transform
-from twofold.outputs.sheets import as_bytes, color_normals, residual_picture, sheet
+from twofold.outputs.sheets import as_bytes, color_normals, residual_image, sheet
 
 
 def noise(seed: int, height: int = 40, width: int = 30) -> np.ndarray:
@@ -114,6 +114,6 @@ def test_normals_look_the_same_from_every_camera_that_sees_the_same() -> None:
 
 def test_residual_is_grey_where_nothing_was_added() -> None:
     base = torch.rand(4, 4, 3, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(residual_picture(base, base), torch.full_like(base, 0.5))
-    assert torch.allclose(residual_picture(base + 0.1, base, gain=2.0), torch.full_like(base, 0.7))
-    assert torch.equal(residual_picture(base - 1, base), torch.zeros_like(base))
+    assert torch.equal(residual_image(base, base), torch.full_like(base, 0.5))
+    assert torch.allclose(residual_image(base + 0.1, base, gain=2.0), torch.full_like(base, 0.7))
+    assert torch.equal(residual_image(base - 1, base), torch.zeros_like(base))

@@ -13,7 +13,7 @@ from twofold.body.skeleton import canonical_pose, pose_body, shape_body
 from twofold.geometry.cameras import Camera, clip_to_box, pixel_grid, pixel_rays, project
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.methods.base import EVALUATION, Avatar, PosedAvatar, Rendering
-from twofold.outputs.views import body_up, draw, look_at, orbit, pose_canonically, rays_at_once
+from twofold.outputs.views import body_up, look_at, orbit, pose_canonically, rays_at_once, render_image
 
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 SHAPED = shape_body(little_body(spacing=0.1), torch.zeros(1))
@@ -71,7 +71,7 @@ def test_each_pixel_is_what_its_ray_sees_and_the_rest_is_background(with_base, c
     avatar = Painted(with_base)
     posed = avatar.pose(*some_pose())
     camera = side_camera(posed)
-    image = draw(avatar, posed, camera, BACKGROUND, chunk)
+    image = render_image(avatar, posed, camera, BACKGROUND, chunk)
     vertices = posed.body.vertices
     low, high = vertices.amin(0) - 0.35, vertices.amax(0) + 0.35
     followed = 0
@@ -98,7 +98,7 @@ def test_each_pixel_is_what_its_ray_sees_and_the_rest_is_background(with_base, c
 def test_rays_are_followed_within_the_box_around_the_body():
     avatar = Painted()
     posed = avatar.pose(*some_pose())
-    draw(avatar, posed, side_camera(posed), BACKGROUND)
+    render_image(avatar, posed, side_camera(posed), BACKGROUND)
     (rays,) = avatar.asked
     low, high = posed.body.vertices.amin(0), posed.body.vertices.amax(0)
     assert rays.far.isfinite().all()
@@ -113,7 +113,7 @@ def test_camera_that_looks_away_sees_background():
     posed = avatar.pose(*some_pose())
     eye = posed.body.vertices.mean(0) + torch.tensor([0.0, 0, 3])
     away = look_at(eye, eye + torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 1, 0]))
-    image = draw(avatar, posed, Camera(away, side_camera(posed).intrinsics, 8, 9), BACKGROUND)
+    image = render_image(avatar, posed, Camera(away, side_camera(posed).intrinsics, 8, 9), BACKGROUND)
     assert torch.equal(image.color, BACKGROUND.expand(8, 9, 3))
     assert sum(map(len, avatar.asked)) == 0
 
@@ -121,19 +121,19 @@ def test_camera_that_looks_away_sees_background():
 def test_residual_is_what_the_base_lacks():
     avatar = Painted()
     posed = avatar.pose(*some_pose())
-    image = draw(avatar, posed, side_camera(posed), BACKGROUND)
+    image = render_image(avatar, posed, side_camera(posed), BACKGROUND)
     assert torch.equal(image.residual, image.color - BACKGROUND)
     assert image.residual.abs().max() > 0.1
-    alone = draw(Painted(with_base=False), posed, side_camera(posed), BACKGROUND)
+    alone = render_image(Painted(with_base=False), posed, side_camera(posed), BACKGROUND)
     assert not alone.residual.any()
 
 
 def test_images_come_back_from_the_device(device):
     posed = Painted().pose(*some_pose())
-    expected = draw(Painted(), posed, side_camera(posed), BACKGROUND)
+    expected = render_image(Painted(), posed, side_camera(posed), BACKGROUND)
     shaped = type(SHAPED)(**{name: tensor.to(device) for name, tensor in vars(SHAPED).items()})
     there = as_avatar(pose_body(shaped, *(tensor.to(device) for tensor in some_pose())))
-    found = draw(Painted().to(device), there, side_camera(posed), BACKGROUND)
+    found = render_image(Painted().to(device), there, side_camera(posed), BACKGROUND)
     assert found.color.device.type == "cpu"
     torch.testing.assert_close(found.color, expected.color)
 

@@ -98,7 +98,7 @@ def test_every_vertex_projects_to_where_the_prepared_body_stood(prepared, import
     for frame in capture.train:
         joints, vertices = posed_reference(
             arrays["rest_joints"], arrays["rest_vertices"], joint_of,
-            arrays["poses"][frame.time], arrays["transl"][frame.time],
+            arrays["poses"][frame.frame_index], arrays["transl"][frame.frame_index],
         )  # fmt: skip
         now = posed(capture, frame)
         for before, after in ((joints, now.joints), (vertices, now.vertices)):
@@ -125,8 +125,8 @@ def test_the_body_is_in_the_t_pose_and_the_world_is_y_up(imported):
 
 def test_every_tenth_frame_is_held_out_between_two_that_train(imported):
     capture = read_capture(imported)
-    assert [frame.time for frame in capture.splits["novel_pose"]] == [5, 15]
-    assert [frame.time for frame in capture.train] == [t for t in range(FRAMES) if t not in (5, 15)]
+    assert [frame.frame_index for frame in capture.splits["novel_pose"]] == [5, 15]
+    assert [frame.frame_index for frame in capture.train] == [t for t in range(FRAMES) if t not in (5, 15)]
     assert capture.splits["novel_view"] == ()
 
 
@@ -143,8 +143,8 @@ def test_images_are_taken_over_bit_by_bit(prepared, imported):
 
 def test_badly_fitted_frames_are_left_out_and_recorded(prepared, tmp_path):
     capture = read_capture(import_prepared(prepared, tmp_path / "out", every_held_out=5, drop_below_iou=0.7))
-    assert [frame.time for frame in capture.splits["novel_pose"]] == [2, 12, 17, 22]
-    assert not {7, 15} & {frame.time for frame in capture.train}
+    assert [frame.frame_index for frame in capture.splits["novel_pose"]] == [2, 12, 17, 22]
+    assert not {7, 15} & {frame.frame_index for frame in capture.train}
     notes = json.loads((tmp_path / "out/capture.json").read_text())["notes"]
     assert notes["left_out"] == [7, 15]
     assert notes["drop_below_iou"] == 0.7
@@ -267,7 +267,7 @@ def test_real_people_stand_inside_their_masks(name, tmp_path):
     if not (REAL / name).is_dir():
         pytest.skip(f"the prepared capture {name} is not at {REAL} (set TWOFOLD_PREPARED)")
     capture = read_capture(import_prepared(REAL / name, tmp_path / name, held_objects="keep", fps=8.0))
-    assert all(frame.time % 10 == 5 for frame in capture.splits["novel_pose"])
+    assert all(frame.frame_index % 10 == 5 for frame in capture.splits["novel_pose"])
     for frame in (*capture.splits["novel_pose"], capture.train[0], capture.train[-1]):
         assert share_inside(capture, frame) > 0.8
     left_arm = capture.body.joints[20] - capture.body.joints[16]
@@ -330,10 +330,10 @@ def test_a_ball_that_passes_in_front_is_ignored_in_those_frames_alone(juggler, t
     capture = read_capture(folder)
     for frame in capture.train:
         hidden = frame.ignored().numpy()
-        assert hidden.any() == (frame.time in balls)
-        if frame.time in balls:
-            assert hidden[balls[frame.time]].mean() > 0.8
-            assert hidden.sum() < 1.7 * balls[frame.time].sum()
+        assert hidden.any() == (frame.frame_index in balls)
+        if frame.frame_index in balls:
+            assert hidden[balls[frame.frame_index]].mean() > 0.8
+            assert hidden.sum() < 1.7 * balls[frame.frame_index].sum()
     notes = json.loads((folder / "capture.json").read_text())["notes"]
     assert notes["objects_ignored"] == [2, 3, 4]
     assert [share > 0 for share in notes["objects_share_of_mask"]] == [time in balls for time in range(8)]

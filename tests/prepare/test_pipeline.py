@@ -43,7 +43,7 @@ def test_a_clip_becomes_a_capture(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "fit", partial(fit, config=FitConfig(steps=(110, 40))))
     stage, told = Stage(tmp_path / "clips", 14), []
     config = PrepareConfig(credit="me", intrinsics=(220.0, 220.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2))
-    done = stage.prepare(tmp_path / "me", config, show=lambda share, what: told.append((share, what)))
+    done = stage.prepare(tmp_path / "me", config, progress=lambda share, what: told.append((share, what)))
     assert validate(tmp_path / "me") == []
     assert done.folder == tmp_path / "me"
     assert done.kept == tuple(range(14))
@@ -80,9 +80,9 @@ def test_the_world_is_turned_but_no_image_changes(tmp_path, monkeypatch):
     torch.testing.assert_close(shown, expected, atol=0.02, rtol=0)
     frame = read_capture(tmp_path / "me").train[9]
     assert frame.image_file.suffix == ".jpg"
-    with Image.open(stage.clips[0] / f"{frame.time:03d}.png") as image:
+    with Image.open(stage.clips[0] / f"{frame.frame_index:03d}.png") as image:
         assert np.abs(np.asarray(image) / 255 - frame.image().numpy()).mean() < 0.02
-    cleaned = clean_mask(stage.evidence["cam0"].masks[frame.time])
+    cleaned = clean_mask(stage.evidence["cam0"].masks[frame.frame_index])
     assert np.array_equal((255 * frame.mask().numpy()).round(), cleaned)
 
 

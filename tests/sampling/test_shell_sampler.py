@@ -54,12 +54,12 @@ def looking(dense, person, monkeypatch):
 
 
 def test_images_are_the_same_with_a_table(looking):
-    (plain, many, _), (tabled, _, posed) = looking(0.0), looking(0.03)
+    (plain, many, _), (tabled, _, posed) = looking(0.0), looking(0.015)
     assert 0.1 < plain.opacity.mean() < 0.9
     for name in ("color", "opacity", "depth", "normal"):
         torch.testing.assert_close(getattr(tabled, name), getattr(plain, name), atol=4e-3, rtol=0)
     # With the table made already, fewer samples are left to ask about.
-    again, few, _ = looking(0.03, posed)
+    again, few, _ = looking(0.015, posed)
     assert torch.equal(again.color, tabled.color)
     assert 0 < few < 0.8 * many
 
@@ -92,7 +92,7 @@ def test_few_samples_are_asked_about_one_by_one(looking, monkeypatch):
 def test_training_asks_about_every_sample(dense, person, looking):
     looking(0.03)
     frame = person.train[1]
-    posed = dense.pose(frame.pose, frame.translation, frame.time, Mode(5))
+    posed = dense.pose(frame.pose, frame.translation, frame.frame_index, Mode(5))
     rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1)[:40])
     dense._sampler._last_grid = None
     dense.render(rays, posed, BLACK, Mode(5), torch.Generator().manual_seed(0))
@@ -130,7 +130,7 @@ def test_strays_are_air_in_training_and_in_images(person):
         avatar = replace(recipe.method, sampler=sampler).build(Subject.of(person))
         for training in (True, False):
             mode = Mode(5) if training else EVALUATION
-            posed = avatar.pose(frame.pose, frame.translation, frame.time, mode)
+            posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
             noise = torch.Generator().manual_seed(0) if training else None
             counts[stray, training] = len(avatar.place(rays, posed, mode, noise).samples)
     assert 0 < counts[0.006, True] < counts[0.0, True]

@@ -5,7 +5,7 @@ import torch
 from twofold.body.skeleton import canonical_pose, pose_body, shape_body
 from twofold.geometry.surfaces import face_areas, point_to_mesh
 from twofold.studio.anatomy import arm_reach, bearing, leg_reach, survey
-from twofold.studio.appearance import HAIRS, SHIRTS, draw_look
+from twofold.studio.appearance import HAIRS, SHIRTS, sample_look
 from twofold.studio.clothing import HAIR, SHIRT, SHOES, SKIN, SOLES, TROUSERS, dress
 from twofold.studio.figure import build_figure
 from twofold.studio.texture import linear, paint
@@ -24,7 +24,7 @@ def shaped():
 @pytest.fixture(scope="module")
 def look():
     # Long sleeves and trousers, so that there is cloth at every joint.
-    return draw_look(3)
+    return sample_look(3)
 
 
 @pytest.fixture(scope="module")
@@ -191,12 +191,12 @@ def test_bending_is_measured_for_each_side_and_direction():
 
 
 def test_seeds_differ_in_what_they_wear():
-    looks = [draw_look(seed) for seed in range(10)]
+    looks = [sample_look(seed) for seed in range(10)]
     assert len(set(looks)) == 10
     assert {look.shirt for look in looks} == set(SHIRTS)
     assert len({look.hair for look in looks}) >= 4
-    assert {look.hair for look in map(draw_look, range(40))} == set(HAIRS)
-    assert draw_look(4) == draw_look(4)
+    assert {look.hair for look in map(sample_look, range(40))} == set(HAIRS)
+    assert sample_look(4) == sample_look(4)
 
 
 def test_each_layer_is_painted_in_its_own_colours(figure, look):

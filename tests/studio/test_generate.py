@@ -67,7 +67,7 @@ def test_a_capture_reads_back_with_its_splits(folder):
     assert [len(capture.splits[s]) for s in ("train", "novel_view", "novel_pose")] == [4, 4, 2]
     assert {frame.camera_name for frame in capture.train} == {"camera00"}
     assert {frame.camera_name for frame in capture.splits["novel_pose"]} == {"camera01"}
-    tested = {frame.time for split in ("novel_view", "novel_pose") for frame in capture.splits[split]}
+    tested = {frame.frame_index for split in ("novel_view", "novel_pose") for frame in capture.splits[split]}
     assert set(capture.meshes) == tested
     assert capture.background == (0, 0, 0)
     assert read_true_motion(folder) is None
@@ -76,7 +76,7 @@ def test_a_capture_reads_back_with_its_splits(folder):
 def test_masks_are_the_silhouettes_of_the_true_meshes(folder):
     capture = read_capture(folder)
     for frame in (capture.splits["novel_view"][0], capture.splits["novel_pose"][-1]):
-        with np.load(capture.meshes[frame.time]) as mesh:
+        with np.load(capture.meshes[frame.frame_index]) as mesh:
             vertices, faces = torch.from_numpy(mesh["vertices"]), torch.from_numpy(mesh["faces"]).long()
         assert (silhouette(frame.camera, vertices, faces, 3) - frame.mask()).abs().max() < 0.15
         assert (silhouette(frame.camera, vertices, faces, 3) - frame.mask()).abs().mean() < 1e-3

@@ -37,9 +37,9 @@ folder, steps, every = Path(sys.argv[2]), int(sys.argv[3]), 3
 recipe = tiny_recipe(steps, checkpoint_every=every, images_per_step=2)
 resume = (folder / "recipe.json").exists()
 print("begun", flush=True)
-def watch(progress):
+def on_step(progress):
     print(progress.step, flush=True)
-train(read_capture(sys.argv[1]), recipe, folder, torch.device("cpu"), resume=resume, watch=watch)
+train(read_capture(sys.argv[1]), recipe, folder, torch.device("cpu"), resume=resume, progress=on_step)
 """
 
 
@@ -90,12 +90,12 @@ def test_an_interrupted_run_continues_to_the_same_bits(person: Capture, tmp_path
     class Stop(Exception):
         """Stands for whatever ends a run between two checkpoints."""
 
-    def watch(progress: object) -> None:
+    def on_step(progress: object) -> None:
         if getattr(progress, "step", 0) == 5:
             raise Stop
 
     with pytest.raises(Stop):
-        train(person, recipe_of(9), tmp_path / "cut", CPU, watch=watch)
+        train(person, recipe_of(9), tmp_path / "cut", CPU, progress=on_step)
     train(person, recipe_of(9), tmp_path / "cut", CPU, resume=True)
     assert_same(state(tmp_path / "whole"), state(tmp_path / "cut"))
 
@@ -119,7 +119,7 @@ def test_only_one_of_two_trainings_at_a_time_gets_the_folder(person: Capture, tm
             refused.append(str(error.value))
 
     train(person, recipe_of(4), tmp_path / "whole", CPU)
-    train(person, recipe_of(4), tmp_path / "run", CPU, watch=again)
+    train(person, recipe_of(4), tmp_path / "run", CPU, progress=again)
     assert str(tmp_path / "run") in refused[0]
     assert_same(state(tmp_path / "whole"), state(tmp_path / "run"))
     assert {path.name for path in (tmp_path / "run").iterdir()} == {p.name for p in (tmp_path / "whole").iterdir()}
@@ -241,7 +241,7 @@ def test_a_surface_that_is_not_finite_ends_a_training(person: Capture, tmp_path:
 def test_parameters_that_are_not_finite_end_a_training_before_they_are_drawn(person: Capture, tmp_path: Path) -> None:
     drawn = []
 
-    def watch(progress: Progress) -> None:
+    def on_step(progress: Progress) -> None:
         if progress.step == 20:
             with torch.no_grad():
                 next(p for p in avatars[0].parameters() if p.ndim == 2)[0, 0] = torch.nan
@@ -249,7 +249,7 @@ def test_parameters_that_are_not_finite_end_a_training_before_they_are_drawn(per
     avatars = []
     with pytest.raises(TwofoldError, match="is not finite at step 20"):
         train(
-            person, tiny_recipe(40, preview_every=20, checkpoint_every=40), tmp_path / "run", CPU, watch=watch,
+            person, tiny_recipe(40, preview_every=20, checkpoint_every=40), tmp_path / "run", CPU, progress=on_step,
             before_first=avatars.append, preview=lambda avatar, step: drawn.append(step),
         )  # fmt: skip
     assert drawn == []

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_LEAST_BEND = 0.17
+_MIN_BEND = 0.17
 """Sine of the angle from which a bent knee or elbow shows its axis (10 degrees)."""
 
 
@@ -30,7 +30,7 @@ def hinge_frame(
         above: world rotations of the body's joint above.
     """
     normal = torch.linalg.cross(limb[:, 0], limb[:, 1], dim=-1)
-    bent = normal.norm(dim=-1) > _LEAST_BEND
+    bent = normal.norm(dim=-1) > _MIN_BEND
     if not bent.any():
         return parent_frame(rotations, bone, rest, above)
     axis = _local_mean(rotations[bent], normal[bent])

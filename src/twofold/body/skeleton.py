@@ -29,7 +29,7 @@ PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18,
 _GENERATIONS = (1, 4, 7, 10, 15, 18, 20, 22, 24)
 """Joints equally far from the root stand together in SMPL's order; here each such group begins (and the last ends)."""
 
-LEAST_SIZE, MOST_SIZE = 0.3, 3.0
+MIN_SIZE, MAX_SIZE = 0.3, 3.0
 """How far a body reaches along its longest axis, metres: newborns and giants are people, other units are not."""
 
 _SHAPES: dict[str, tuple[str | int, ...]] = {
@@ -142,9 +142,9 @@ def require_surface(
 def size_fault(vertices: np.ndarray) -> str:
     """How a body with these vertices (metres) is no person's size, to end a sentence; empty where it is."""
     longest = float(np.ptp(vertices, axis=0).max())
-    if LEAST_SIZE <= longest <= MOST_SIZE:
+    if MIN_SIZE <= longest <= MAX_SIZE:
         return ""
-    return f"should make a body of {LEAST_SIZE:g} to {MOST_SIZE:g} metres, it measures {longest:.3g}"
+    return f"should make a body of {MIN_SIZE:g} to {MAX_SIZE:g} metres, it measures {longest:.3g}"
 
 
 @dataclass(frozen=True)

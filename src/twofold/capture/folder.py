@@ -65,7 +65,7 @@ def capture_of(contents: Contents) -> Capture:
     splits = {
         split: tuple(
             Frame(
-                time=time,
+                frame_index=time,
                 camera_name=name,
                 camera=contents.cameras[name],
                 pose=poses[time],

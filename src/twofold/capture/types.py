@@ -27,7 +27,7 @@ class Frame:
     One that is damaged or gone is a `TwofoldError` then.
 
     Attributes:
-        time: index of the frame in the capture's motion.
+        frame_index: index of the frame in the capture's motion.
         camera_name: which camera.
         camera: that camera.
         pose: axis-angle rotations, root first, radians, relative to SMPL's T-pose.
@@ -37,7 +37,7 @@ class Frame:
         ignored_file: one channel, 255 where nobody knows what the person looks like; None where all is known.
     """
 
-    time: int
+    frame_index: int
     camera_name: str
     camera: Camera
     pose: Float[Tensor, "24 3"]

@@ -7,7 +7,7 @@ import numpy as np
 from twofold.check.findings import Finding, counted, graded, places, places_of
 from twofold.check.frame_measures import FrameFacts
 from twofold.check.measure import POOR, Doubt, Facts, inverted
-from twofold.prepare.silhouettes import LEAST_IOU, MOST_BAD
+from twofold.prepare.silhouettes import MAX_BAD, MIN_IOU
 
 BETTER, TELLING = 0.03, 0.1
 """A twin fits better when its IoU is higher by so much; it tells something where it covers so much else."""
@@ -15,7 +15,7 @@ LARGER, SMALLER = 1.2, 0.92
 """Loose clothes make a mask up to a fifth larger in length than the body; a smaller one cuts the person."""
 OFF = 0.05
 """Masks off the body's middle by more than this, in body heights, everywhere alike: a hand's breadth."""
-MOST_NAMED = 4
+MAX_NAMED = 4
 """At most this many exchanged images are named one by one."""
 
 
@@ -25,7 +25,7 @@ def agreement(facts: Facts) -> Iterator[Finding]:
     frames = [f for f in facts.frames if not inverted(f)]
     if upside:
         yield Finding(
-            graded(len(upside) > MOST_BAD * len(facts.frames)),
+            graded(len(upside) > MAX_BAD * len(facts.frames)),
             "inverted masks",
             f"{counted(len(upside), 'mask')} inverted: the surroundings are white",
             "Exchange black and white there.",
@@ -40,7 +40,7 @@ def agreement(facts: Facts) -> Iterator[Finding]:
         late = "later" if delay > 0 else "earlier"
         explained.append(
             Finding(
-                graded(iou < LEAST_IOU),
+                graded(iou < MIN_IOU),
                 "delay",
                 f"Images fit the poses of {counted(abs(delay), 'frame')} {late} better, by {gain:.2f} in IoU",
                 f"Move the rows of motion.npz by {-delay:+d}, or rename the images.",
@@ -90,10 +90,10 @@ def _disagreement(iou: float, where: str) -> Finding:
 
 def _bad_frames(facts: Facts, frames: list[FrameFacts]) -> Iterator[Finding]:
     if facts.elsewhere:
-        named = ", ".join(f"{time} shows the pose of {other}" for _, time, other in facts.elsewhere[:MOST_NAMED])
-        more = f", and {len(facts.elsewhere) - MOST_NAMED} more" if len(facts.elsewhere) > MOST_NAMED else ""
+        named = ", ".join(f"{time} shows the pose of {other}" for _, time, other in facts.elsewhere[:MAX_NAMED])
+        more = f", and {len(facts.elsewhere) - MAX_NAMED} more" if len(facts.elsewhere) > MAX_NAMED else ""
         yield Finding(
-            graded(len(facts.elsewhere) > MOST_BAD * len(frames)),
+            graded(len(facts.elsewhere) > MAX_BAD * len(frames)),
             "exchanged images",
             f"{counted(len(facts.elsewhere), 'image')} with the pose of another frame: {named}{more}",
             "Put images and poses into the same order, or leave them out: check --write-splits.",
@@ -101,30 +101,30 @@ def _bad_frames(facts: Facts, frames: list[FrameFacts]) -> Iterator[Finding]:
             tuple((camera, time) for camera, time, _ in facts.elsewhere),
         )
     known = {(camera, time) for camera, time, _ in facts.elsewhere}
-    rest = [f for f in frames if f.iou < LEAST_IOU and (f.camera, f.time) not in known]
+    rest = [f for f in frames if f.iou < MIN_IOU and (f.camera, f.frame_index) not in known]
     if rest:
         yield Finding(
-            graded(len(rest) > MOST_BAD * len(frames)),
+            graded(len(rest) > MAX_BAD * len(frames)),
             "bad frames",
-            f"In {counted(len(rest), 'image')} body and mask do not agree: IoU below {LEAST_IOU:g}, down to "
+            f"In {counted(len(rest), 'image')} body and mask do not agree: IoU below {MIN_IOU:g}, down to "
             f"{min(f.iou for f in rest):.2f}",
             "Fit these again, fix their masks, or leave them out: check --write-splits, or prepare --drop FRAMES.",
             places(rest),
-            tuple((f.camera, f.time) for f in rest),
+            tuple((f.camera, f.frame_index) for f in rest),
         )
 
 
 def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
     telling = [f for f in frames if f.twins.sides_differ > TELLING]
-    swapped = [f for f in telling if f.twins.sides > max(f.twins.given + BETTER, LEAST_IOU)]
+    swapped = [f for f in telling if f.twins.sides > max(f.twins.given + BETTER, MIN_IOU)]
     if swapped:
         yield Finding(
-            graded(len(swapped) > MOST_BAD * len(telling)),
+            graded(len(swapped) > MAX_BAD * len(telling)),
             "sides",
             f"In {counted(len(swapped), 'image')} the body fits better with left and right limbs exchanged",
             "Exchange left and right in these poses, or leave them out: check --write-splits.",
             places(swapped),
-            tuple((f.camera, f.time) for f in swapped),
+            tuple((f.camera, f.frame_index) for f in swapped),
         )
     if len(telling) < 0.25 * len(frames):
         yield Finding(
@@ -138,18 +138,18 @@ def _sides(frames: list[FrameFacts]) -> Iterator[Finding]:
         f
         for f in frames
         if f.twins.facing_differs > TELLING
-        and f.twins.facing > max(f.twins.given + BETTER, LEAST_IOU)
+        and f.twins.facing > max(f.twins.given + BETTER, MIN_IOU)
         and f not in swapped
     ]
     if turned:
         yield Finding(
-            graded(len(turned) > MOST_BAD * len(frames)),
+            graded(len(turned) > MAX_BAD * len(frames)),
             "facing",
             f"In {counted(len(turned), 'image')} the body fits better facing the other way",
             "Rotate these roots by 180 degrees about the body's axis and swap left and right, or leave them out: check "
             "--write-splits.",
             places(turned),
-            tuple((f.camera, f.time) for f in turned),
+            tuple((f.camera, f.frame_index) for f in turned),
         )
 
 

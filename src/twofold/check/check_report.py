@@ -22,7 +22,7 @@ from twofold.errors import TwofoldError
 from twofold.files import json_text, write_together
 from twofold.html.charts import SERIES, Bar, Curve, bars_svg, directions_svg, dots_svg
 from twofold.html.page import KeyMetric, Table, embedded_image, render
-from twofold.prepare.silhouettes import LEAST_IOU
+from twofold.prepare.silhouettes import MIN_IOU
 from twofold.prepare.turning import SEEN, sides_seen
 
 REPORT, NUMBERS = "index.html", "check.json"
@@ -161,7 +161,7 @@ def _sentence(judgement: Judgement) -> str:
 
 def _key_metrics(facts: Facts) -> list[KeyMetric]:
     ious = np.array([f.iou for f in facts.frames])
-    mean, bad = float(ious.mean()), int((ious < LEAST_IOU).sum())
+    mean, bad = float(ious.mean()), int((ious < MIN_IOU).sum())
     return [
         KeyMetric("Body on mask", f"{mean:.2f}", "IoU", f"{GOOD_IOU:g} or more", mean >= GOOD_IOU),
         KeyMetric("Badly fitted", f"{bad}", f"of {len(ious)}", "none", bad == 0),
@@ -172,7 +172,7 @@ def _key_metrics(facts: Facts) -> list[KeyMetric]:
 
 
 def _sheets(facts: Facts, capture: Capture) -> list[dict[str, Any]]:
-    frames = {(f.camera_name, f.time): f for split in capture.splits.values() for f in split}
+    frames = {(f.camera_name, f.frame_index): f for split in capture.splits.values() for f in split}
     shaped = shape_body(capture.body, capture.betas)
     sides = side_of_faces(shaped)
     worst = sorted(facts.frames, key=lambda f: f.iou)[:WORST]
@@ -180,8 +180,12 @@ def _sheets(facts: Facts, capture: Capture) -> list[dict[str, Any]]:
     even = spread([f for f in facts.frames if f not in worst and f not in hidden], EVEN)
 
     def shown(f: FrameFacts) -> dict[str, Any]:
-        pixels = overlay(frames[f.camera, f.time], shaped, sides)
-        return {"image": embedded_image(pixels, f"{f.camera} {f.time}", "jpeg"), "iou": f.iou, "low": f.iou < LEAST_IOU}
+        pixels = overlay(frames[f.camera, f.frame_index], shaped, sides)
+        return {
+            "image": embedded_image(pixels, f"{f.camera} {f.frame_index}", "jpeg"),
+            "iou": f.iou,
+            "low": f.iou < MIN_IOU,
+        }
 
     with torch.inference_mode():
         return [
@@ -194,12 +198,12 @@ def _sheets(facts: Facts, capture: Capture) -> list[dict[str, Any]]:
 def _agreement(facts: Facts) -> dict[str, Any]:
     """The silhouette IoU of each camera over its frames."""
     series: dict[str, list[FrameFacts]] = {camera.name: [] for camera in facts.cameras}
-    for frame in sorted(facts.frames, key=lambda f: f.time):
+    for frame in sorted(facts.frames, key=lambda f: f.frame_index):
         series[frame.camera].append(frame)
-    curves = [Curve(name, [f.time for f in own], [f.iou for f in own]) for name, own in series.items() if own]
+    curves = [Curve(name, [f.frame_index for f in own], [f.iou for f in own]) for name, own in series.items() if own]
     names = [curve.name for curve in curves]
     legend = names if len(names) <= SERIES else [*names[: SERIES - 1], "others"]
-    svg = dots_svg("Silhouette IoU over frames", curves, LEAST_IOU)
+    svg = dots_svg("Silhouette IoU over frames", curves, MIN_IOU)
     return {"svg": svg, "legend": legend if len(names) > 1 else []}
 
 

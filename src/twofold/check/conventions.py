@@ -21,7 +21,7 @@ from twofold.prepare.silhouettes import overlap
 
 AROUND = 0.5
 """The window reaches beyond the mask by so much of its longer side; a body drawn farther off counts as missing it."""
-LEAST_GAIN, LEAST_GAIN_WHERE_GOOD, LEAST_GAIN_OF_MOVING = 0.1, 0.06, 0.02
+MIN_GAIN, MIN_GAIN_WHERE_GOOD, MIN_GAIN_OF_MOVING = 0.1, 0.06, 0.02
 """A guess must raise the mean IoU by so much to be named. Where bodies fit well already less will do: the fits of real
 people leave 0.01 to such guesses; about the translation less still, because some conventions differ by centimetres."""
 GOOD_ENOUGH = 0.55
@@ -32,7 +32,7 @@ IN_MOST = 0.75
 """Share of the frames in which a guess must be better."""
 EXCHANGED, EXCHANGED_GAIN = 0.7, 0.15
 """An image shows another frame's pose where that fits so well, and so much better than its own."""
-MOST_PAIRS = 16
+MAX_PAIRS = 16
 """This many of some seven hundred pairs are tried on all frames."""
 MOMENTS = 5
 """Up to this many frames early or late are tried."""
@@ -47,14 +47,14 @@ class Sample:
         mask: in the window around the person.
         known: pixels of the window that are not ignored.
         to_window: from pixels of the image to pixels of the window.
-        time: frame.
+        frame_index: which frame of the capture.
     """
 
     placed: Placed
     mask: Bool[np.ndarray, "a b"]
     known: Bool[np.ndarray, "a b"]
     to_window: Float[Tensor, "3 3"]
-    time: int
+    frame_index: int
 
     def fit(self, placed: Placed) -> float:
         """Silhouette IoU, drawn roughly."""
@@ -98,7 +98,7 @@ def sample_of(frame: Frame, points: ShapedBody) -> Sample:
         posed_points(points, frame.pose, frame.translation), points, frame.pose, frame.translation,
         camera.world_to_camera, camera.intrinsics, camera.height, camera.width,
     )  # fmt: skip
-    return Sample(placed, window.mask(mask), ~window.mask(ignored), to_window, frame.time)
+    return Sample(placed, window.mask(mask), ~window.mask(ignored), to_window, frame.frame_index)
 
 
 def diagnose(samples: Sequence[Sample], size_ratio: float = 1.0) -> Diagnosis:
@@ -119,9 +119,9 @@ def diagnose(samples: Sequence[Sample], size_ratio: float = 1.0) -> Diagnosis:
     # Some conventions differ in some frames alone, such as those where the root is turned.
     different = np.abs(found - given) > 0.005
     better_in = float((found > given)[different].mean()) if different.any() else 0.0
-    gain = LEAST_GAIN_WHERE_GOOD if given.mean() > GOOD_ENOUGH else LEAST_GAIN
+    gain = MIN_GAIN_WHERE_GOOD if given.mean() > GOOD_ENOUGH else MIN_GAIN
     if given.mean() > GOOD_ENOUGH and all(c.family == "translation" for c in best):
-        gain = LEAST_GAIN_OF_MOVING
+        gain = MIN_GAIN_OF_MOVING
     if found.mean() < max(given.mean() + gain, GOOD_ENOUGH) or better_in < IN_MOST:
         best = ()
     return Diagnosis(float(given.mean()), best, float(found.mean()), better_in)
@@ -137,13 +137,16 @@ def best_shift(
         frames where no other number is better beyond doubt.
     """
     shifts = [k for k in range(-MOMENTS, MOMENTS + 1) if k]
-    usable = [s for s in samples if MOMENTS <= s.time < len(poses) - MOMENTS]
+    usable = [s for s in samples if MOMENTS <= s.frame_index < len(poses) - MOMENTS]
     if len(usable) < 6:
         return 0, 0.0, 0.0
     given = np.array([s.fit(s.placed) for s in usable])
     gains: dict[int, np.ndarray] = {}
     for k in shifts:
-        moved = [replace(s.placed, translation=translations[s.time + k]).posed(poses[s.time + k]) for s in usable]
+        moved = [
+            replace(s.placed, translation=translations[s.frame_index + k]).posed(poses[s.frame_index + k])
+            for s in usable
+        ]
         gains[k] = np.array([s.fit(p) for s, p in zip(usable, moved, strict=True)]) - given
     k = max(shifts, key=lambda k: gains[k].mean())
     gain, better = float(gains[k].mean()), float((gains[k] > 0).mean())
@@ -164,7 +167,7 @@ def poses_elsewhere(
         fits = [sample.fit(placed) for placed in moved]
         best = int(np.argmax(fits)) if fits else 0
         good = bool(fits) and fits[best] > max(EXCHANGED, sample.fit(sample.placed) + EXCHANGED_GAIN)
-        found.append(times[best] if good and abs(times[best] - sample.time) > 1 else None)
+        found.append(times[best] if good and abs(times[best] - sample.frame_index) > 1 else None)
     return found
 
 
@@ -180,7 +183,7 @@ def _likely_pairs(samples: Sequence[Sample], guesses: Sequence[Convention]) -> l
             for other in able[i + 1 :]:
                 if one.family != other.family:
                     rough[one, other] += sample.fit(other.change(changed))
-    likely = sorted(rough, key=lambda pair: -rough[pair])[:MOST_PAIRS]
+    likely = sorted(rough, key=lambda pair: -rough[pair])[:MAX_PAIRS]
     return [pair for pair in rough if pair in likely]
 
 

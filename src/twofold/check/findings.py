@@ -84,7 +84,7 @@ def counted(number: int, noun: str) -> str:
 
 def places(frames: Iterable[FrameFacts]) -> str:
     """Cameras and times of frames in few words."""
-    return places_of((f.camera, f.time) for f in frames)
+    return places_of((f.camera, f.frame_index) for f in frames)
 
 
 def places_of(images: Iterable[tuple[str, int]]) -> str:

@@ -77,7 +77,7 @@ class FrameFacts:
 
     Attributes:
         camera: its name.
-        time: frame.
+        frame_index: which frame of the capture.
         split: of the capture.
         iou: silhouette of the posed body and mask, where nothing is ignored.
         size_ratio: root of mask area over body area; above 1 the mask is larger.
@@ -91,7 +91,7 @@ class FrameFacts:
     """
 
     camera: str
-    time: int
+    frame_index: int
     split: str
     iou: float
     size_ratio: float
@@ -286,7 +286,7 @@ def frame_facts(frame: Frame, split: str, shaped: ShapedBody, points: ShapedBody
     inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(-1) & (depth > 0)
     return FrameFacts(
         camera=frame.camera_name,
-        time=frame.time,
+        frame_index=frame.frame_index,
         split=split,
         iou=overlap(shown, body),
         size_ratio=float(np.sqrt(shown.sum() / max(body.sum(), 1))),

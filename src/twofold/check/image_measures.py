@@ -44,7 +44,7 @@ class Background:
 
 def background_of(frames: Sequence[Frame]) -> Background:
     """Compares the surroundings in images of one camera with those in the first of them."""
-    times = tuple(frame.time for frame in frames[1:])
+    times = tuple(frame.frame_index for frame in frames[1:])
     views = [_surroundings(frame) for frame in frames]
     if len(views) < 2 or views[0].plain:
         return Background(times, None, ())

@@ -26,11 +26,11 @@ from twofold.check.motion_measures import MotionFacts, motion_facts
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import project
 
-MOST_LOOKED_AT = 100
+MAX_LOOKED_AT = 100
 """Images that are looked at unless more are asked for: a tenth of a second each."""
-MOST_VALIDATED = 1000
+MAX_VALIDATED = 1000
 """Images of a longer capture that are opened to find damaged ones; training opens them all."""
-SAMPLES, MOMENT_SAMPLES, BACKGROUNDS, BACKS, MOST_EXCHANGED = 12, 24, 24, 20, 40
+SAMPLES, MOMENT_SAMPLES, BACKGROUNDS, BACKS, MAX_EXCHANGED = 12, 24, 24, 20, 40
 """Frames on which conventions and frames are tried, backgrounds of a camera and views from behind that are looked at,
 bad frames whose pose is looked for elsewhere."""
 POOR = 0.65
@@ -122,14 +122,14 @@ class Facts:
 
 
 def measure_capture(
-    folder: Path | str, most: int = MOST_LOOKED_AT, watch: Callable[[float], None] = lambda done: None
+    folder: Path | str, most: int = MAX_LOOKED_AT, progress: Callable[[float], None] = lambda done: None
 ) -> tuple[Facts, Capture]:
     """Measures everything in a capture folder.
 
     Args:
         folder: the capture.
         most: this many images are checked, spread evenly, two thirds of them training images.
-        watch: called with the fraction that is done.
+        progress: called with the fraction that is done.
 
     Raises:
         TwofoldError: it cannot be used at all. Every fault is listed; where the body merely stands in the wrong place,
@@ -142,32 +142,34 @@ def measure_capture(
     points = surface_points(shaped)
     every = [(split, frame) for split, frames in capture.splits.items() for frame in frames]
     train = [item for item in every if item[0] == "train"]
-    other = sorted((i for i in every if i[0] != "train"), key=lambda i: (i[1].camera_name, i[1].time))
+    other = sorted((i for i in every if i[0] != "train"), key=lambda i: (i[1].camera_name, i[1].frame_index))
     share = max(most - len(other), round(2 * most / 3))
     chosen = spread(train, share) + spread(other, max(most - min(share, len(train)), 0))
     looked: list[FrameFacts] = []
     for i, (split, frame) in enumerate(chosen):
         looked.append(frame_facts(frame, split, shaped, points))
-        watch(0.75 * (i + 1) / len(chosen))
-    by_place = {(frame.camera_name, frame.time): frame for _, frame in chosen}
+        progress(0.75 * (i + 1) / len(chosen))
+    by_place = {(frame.camera_name, frame.frame_index): frame for _, frame in chosen}
     doubts = _doubts(looked, by_place, points)
-    watch(0.85)
+    progress(0.85)
     sound = [f for f in looked if not inverted(f)]
     poses, translations = _motion(contents)
-    samples = [sample_of(by_place[f.camera, f.time], points) for f in spread(sound, MOMENT_SAMPLES)]
+    samples = [sample_of(by_place[f.camera, f.frame_index], points) for f in spread(sound, MOMENT_SAMPLES)]
     delay, gain, _ = best_shift(samples, poses, translations)
     elsewhere: list[tuple[str, int, int]] = []
     bad = [f for f in sound if f.iou < POOR]
     if len(bad) < 0.5 * len(sound):
         # Where most of them are bad, something else is the matter.
-        samples = [sample_of(by_place[f.camera, f.time], points) for f in spread(bad, MOST_EXCHANGED)]
-        others = poses_elsewhere(samples, spread(sorted({f.time for f in looked}), MOST_LOOKED_AT), poses, translations)
+        samples = [sample_of(by_place[f.camera, f.frame_index], points) for f in spread(bad, MAX_EXCHANGED)]
+        others = poses_elsewhere(
+            samples, spread(sorted({f.frame_index for f in looked}), MAX_LOOKED_AT), poses, translations
+        )
         elsewhere = [
-            (f.camera, f.time, other)
-            for f, other in zip(spread(bad, MOST_EXCHANGED), others, strict=True)
-            if other in {g.time for g in bad}
+            (f.camera, f.frame_index, other)
+            for f, other in zip(spread(bad, MAX_EXCHANGED), others, strict=True)
+            if other in {g.frame_index for g in bad}
         ]
-    watch(0.95)
+    progress(0.95)
     by_camera = _grouped(frame for _, frame in chosen)
     training = [name for name in by_camera if any(f.camera_name == name for f in capture.train)]
     backs = spread([frame for _, frame in chosen if shows_its_back(frame, shaped)], BACKS)
@@ -177,21 +179,21 @@ def measure_capture(
         credit=capture.credit,
         fps=capture.fps,
         images={split: len(frames) for split, frames in capture.splits.items()},
-        train_times=frozenset(frame.time for frame in capture.train),
+        train_times=frozenset(frame.frame_index for frame in capture.train),
         stature=stature(shaped),
         frames=tuple(looked),
         cameras=_cameras(contents, looked, by_camera, shaped),
         motion=motion_facts(poses, translations, shaped.joints, capture.splits, capture.fps),
         backgrounds={name: background_of(spread(by_camera[name], BACKGROUNDS)) for name in training[:4]},
-        backs=tuple((f.camera_name, f.time) for f in backs),
-        faces=tuple((f.camera_name, f.time) for f in backs if sees_a_face(f, shaped)),
+        backs=tuple((f.camera_name, f.frame_index) for f in backs),
+        faces=tuple((f.camera_name, f.frame_index) for f in backs if sees_a_face(f, shaped)),
         doubts=doubts,
         delay=(delay, gain),
         elsewhere=tuple(elsewhere),
         twins=_twins(capture),
         repeated=_repeated(capture.train),
     )
-    watch(1.0)
+    progress(1.0)
     return facts, capture
 
 
@@ -199,9 +201,9 @@ def _usable(folder: Path) -> Contents:
     """A capture's contents, if there is no fault in them."""
     contents, faults = read_contents(folder)
     thinned = contents
-    if sum(map(len, contents.images.values())) > MOST_VALIDATED:
+    if sum(map(len, contents.images.values())) > MAX_VALIDATED:
         thinned = replace(
-            contents, splits={k: tuple(spread(v, MOST_VALIDATED // 3)) for k, v in contents.splits.items()}
+            contents, splits={k: tuple(spread(v, MAX_VALIDATED // 3)) for k, v in contents.splits.items()}
         )
     found = [*faults, *quick_faults(contents), *pixel_faults(thinned), *mesh_faults(folder)]
     if not found:
@@ -263,7 +265,7 @@ def _doubts(
         if len(inside) < 2:
             continue
         ratio = float(np.median([f.size_ratio for f in inside]))
-        samples = [sample_of(frames[f.camera, f.time], points) for f in spread(inside, SAMPLES)]
+        samples = [sample_of(frames[f.camera, f.frame_index], points) for f in spread(inside, SAMPLES)]
         doubts.append(Doubt(names, diagnose(samples, ratio)))
         if doubts[0].diagnosis.conventions:
             break
@@ -310,7 +312,7 @@ def _by_camera(looked: Iterable[FrameFacts]) -> dict[str, list[FrameFacts]]:
 
 def _grouped(frames: Iterable[Frame]) -> dict[str, list[Frame]]:
     groups: dict[str, list[Frame]] = defaultdict(list)
-    for frame in sorted(frames, key=lambda f: f.time):
+    for frame in sorted(frames, key=lambda f: f.frame_index):
         groups[frame.camera_name].append(frame)
     return dict(groups)
 
@@ -325,18 +327,18 @@ def _twins(capture: Capture) -> tuple[tuple[str, str, int], ...]:
         for frame in frames if split != "train" else ():
             alike = sizes.get(frame.image_file.stat().st_size, [])
             if alike and _digest(frame) in {_digest(other) for other in alike}:
-                found.append((split, frame.camera_name, frame.time))
+                found.append((split, frame.camera_name, frame.frame_index))
     return tuple(found)
 
 
 def _repeated(train: Sequence[Frame]) -> tuple[int, ...]:
     """Frames whose image is the one before, byte for byte, as frozen or stretched videos have them."""
     found: list[int] = []
-    ordered = sorted(train, key=lambda f: (f.camera_name, f.time))
+    ordered = sorted(train, key=lambda f: (f.camera_name, f.frame_index))
     for one, other in itertools.pairwise(ordered):
         same_size = one.image_file.stat().st_size == other.image_file.stat().st_size
         if one.camera_name == other.camera_name and same_size and _digest(one) == _digest(other):
-            found.append(other.time)
+            found.append(other.frame_index)
     return tuple(found)
 
 

@@ -84,9 +84,9 @@ def motion_facts(
         splits: the capture's.
         fps: frames per second.
     """
-    times = sorted({frame.time for frames in splits.values() for frame in frames})
+    times = sorted({frame.frame_index for frames in splits.values() for frame in frames})
     train = splits["train"]
-    train_times = sorted({frame.time for frame in train})
+    train_times = sorted({frame.frame_index for frame in train})
     rotations = axis_angle_to_matrix(poses)
     transforms = joint_transforms(joints, poses, translations)
     placed = (transforms[..., :3, :3] @ joints[:, :, None])[..., 0] + transforms[..., :3, 3]
@@ -94,12 +94,12 @@ def motion_facts(
     moving = torch.cat([placed[:, :1], inside[:, 1:]], 1)
     jumps: list[int] = []
     deviations: list[np.ndarray] = []
-    for run in _runs(times, {frame.time for frame in splits.get("novel_pose", ())}):
+    for run in _runs(times, {frame.frame_index for frame in splits.get("novel_pose", ())}):
         bad, deviation = _jumps(moving[run], rotations[run, 0], np.array(run) / fps)
         jumps += [time for time, yes in zip(run, bad.tolist(), strict=True) if yes]
         deviations.append(deviation)
     azimuths, elevations = _directions(train, rotations[:, 0], placed[:, 0])
-    novel = sorted({frame.time for frame in splits.get("novel_pose", ())})
+    novel = sorted({frame.frame_index for frame in splits.get("novel_pose", ())})
     few = torch.tensor(spread(train_times, 150))
     apart = _apart(rotations[few], rotations[novel]).amax(-1).amin(0) if novel else torch.empty(0)
     upward = torch.nn.functional.normalize(placed[:, 12] - placed[:, 0], dim=-1)[times, 1]
@@ -141,7 +141,7 @@ def _directions(
     """Where the camera of each frame stands as the body sees it: degrees around and above."""
     if not frames:
         return [], []
-    times = [frame.time for frame in frames]
+    times = [frame.frame_index for frame in frames]
     return camera_directions(roots[times], pelvises[times], torch.stack([frame.camera.center for frame in frames]))
 
 

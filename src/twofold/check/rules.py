@@ -12,7 +12,7 @@ from twofold.check.frame_measures import FrameFacts
 from twofold.check.measure import CameraFacts, Facts, inverted
 from twofold.check.motion_measures import LIMBS, STILL
 from twofold.prepare.detect.background import MOVING
-from twofold.prepare.silhouettes import MOST_BAD
+from twofold.prepare.silhouettes import MAX_BAD
 from twofold.prepare.turning import SEEN
 
 STATURES, POSSIBLE_STATURES = (1.2, 2.2), (0.5, 3.0)
@@ -253,7 +253,7 @@ def _motion(facts: Facts) -> Iterator[Finding]:
     rest = [t for t in motion.jumps if t not in facts.train_times]
     if trained:
         yield Finding(
-            graded(len(trained) > MOST_BAD * len(motion.frames)),
+            graded(len(trained) > MAX_BAD * len(motion.frames)),
             "jumps",
             f"{counted(len(trained), 'frame')} cannot be reached in time from the one before: failed or exchanged "
             "frames, or a wrong `fps`",

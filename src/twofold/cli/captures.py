@@ -35,8 +35,8 @@ def studio(
     from twofold.studio.generate import StudioConfig, make_studio
 
     config = StudioConfig(seed, size, frames, cameras, pose_noise, mask_noise, background)
-    with bar("Filming") as show:
-        make_studio(config, out, lambda done: show(done, ""))
+    with bar("Filming") as progress:
+        make_studio(config, out, lambda done: progress(done, ""))
     say(f"The capture is in {out}.", f"twofold train {out}")
 
 
@@ -123,8 +123,8 @@ def prepare(
         fps, max_size, read_intrinsics(intrinsics), calibration, train_camera, held_out, held_objects, credit,
         masks, landmarks, poses, several_people, person, read_frames(drop),
     )  # fmt: skip
-    with bar("Preparing") as show:
-        prepared = make(videos, out, read_body(body), mediapipe_estimator, config, show, count_people)
+    with bar("Preparing") as progress:
+        prepared = make(videos, out, read_body(body), mediapipe_estimator, config, progress, count_people)
     for sentence in prepared.warnings:
         console().print(f"Note: {sentence}", soft_wrap=True)
     say(f"The capture is in {out}: {prepared.summary()}", f"twofold check {out}")
@@ -153,11 +153,11 @@ def check(
     within(max_images=(max_images, 2, None))
     require_capture(capture)
     require_no_file(out or capture / "check")
-    with bar("Checking") as show:
-        facts, read = measure_capture(capture, max_images, lambda done: show(0.9 * done, ""))
+    with bar("Checking") as progress:
+        facts, read = measure_capture(capture, max_images, lambda done: progress(0.9 * done, ""))
         judgement = judge(facts)
         page = write_check(facts, read, judgement, out or capture / "check")
-        show(1.0, "")
+        progress(1.0, "")
     for finding in judgement.findings:
         console().print(f"{finding.level}: {finding}", soft_wrap=True)
     console().print(judgement.words, soft_wrap=True)

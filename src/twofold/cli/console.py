@@ -78,23 +78,23 @@ def bar(title: str) -> Generator[Callable[[float, str], None], None, None]:
     with Progress(
         *columns, TimeElapsedColumn(), left, TextColumn("{task.fields[note]}"),
         console=out, refresh_per_second=4, disable=not out.is_terminal,
-    ) as progress:  # fmt: skip
-        task = progress.add_task(title, total=1.0, note="")
-        told, last = 0, time.monotonic()
+    ) as display:  # fmt: skip
+        task = display.add_task(title, total=1.0, note="")
+        reported, last = 0, time.monotonic()
 
-        def show(done: float, note: str) -> None:
-            nonlocal told, last
-            progress.update(task, completed=done, note=note)
+        def progress(done: float, note: str) -> None:
+            nonlocal reported, last
+            display.update(task, completed=done, note=note)
             left.note(done)
             tenths, now = int(10 * done), time.monotonic()
-            if out.is_terminal or (tenths == told and now - last < LINE_EVERY):
+            if out.is_terminal or (tenths == reported and now - last < LINE_EVERY):
                 return
-            told, last = tenths, now
+            reported, last = tenths, now
             seconds = left.seconds()
             parts = [f"{100 * done:.0f} %", *([f"{timedelta(seconds=round(seconds))} left"] if seconds else []), note]
             out.print(f"{title}: {', '.join(filter(None, parts))}", soft_wrap=True)
 
-        yield show
+        yield progress
 
 
 def say(result: str, following: str) -> None:

@@ -22,7 +22,7 @@ from twofold.outputs.export.write import ExportRequest, export, missing_packages
 from twofold.outputs.gallery import comparison, motion_frames, orbit_frames, panels, save_png, scene_up
 from twofold.outputs.sheets import sheet
 from twofold.outputs.video import write_video
-from twofold.outputs.views import draw, orbit, pose_canonically
+from twofold.outputs.views import orbit, pose_canonically, render_image
 from twofold.recipe import Recipe
 from twofold.report import (
     CaptionedImage,
@@ -51,13 +51,13 @@ EXPORT = ExportRequest(("glb", "vrm"), BakeConfig(frames=24))
 """What the demo leaves for other programs, where the packages for it are installed."""
 
 
-def run_demo(out: Path, seed: int, show: Callable[[float, str], None]) -> Path:
+def run_demo(out: Path, seed: int, progress: Callable[[float, str], None]) -> Path:
     """Does it all.
 
     Args:
         out: folder to make; a demo that lies there is overwritten.
         seed: who is filmed.
-        show: called with the fraction that is done and what is being done.
+        progress: called with the fraction that is done and what is being done.
 
     Returns:
         the page.
@@ -68,7 +68,7 @@ def run_demo(out: Path, seed: int, show: Callable[[float, str], None]) -> Path:
     config, recipe = StudioConfig(seed=seed, size=SIZE, frames=FRAMES, cameras=CAMERAS), demo_recipe(seed)
     _claim(out)
     with locked(out, "filled"):
-        return _fill(out, seed, config, recipe, show)
+        return _fill(out, seed, config, recipe, progress)
 
 
 def _claim(out: Path) -> None:
@@ -98,7 +98,7 @@ def _maker(stored: object) -> object:
     return notes.get("made_by", notes.get("name")) if isinstance(notes, dict) else None
 
 
-def _fill(out: Path, seed: int, config: StudioConfig, recipe: Recipe, show: Callable[[float, str], None]) -> Path:
+def _fill(out: Path, seed: int, config: StudioConfig, recipe: Recipe, progress: Callable[[float, str], None]) -> Path:
     """Films, trains, measures and shows; returns the report."""
     begun = time.monotonic()
     seconds: dict[str, float] = {}
@@ -106,8 +106,10 @@ def _fill(out: Path, seed: int, config: StudioConfig, recipe: Recipe, show: Call
     def lap(name: str) -> None:
         seconds[name] = time.monotonic() - begun - sum(seconds.values())
 
-    show(0.0, "filming a synthetic subject")
-    make_studio(config, out / "capture", lambda done: show(0.12 * done, "filming a synthetic subject"), overwrite=True)
+    progress(0.0, "filming a synthetic subject")
+    make_studio(
+        config, out / "capture", lambda done: progress(0.12 * done, "filming a synthetic subject"), overwrite=True
+    )
     capture = read_capture(out / "capture")
     lap("studio")
 
@@ -115,29 +117,29 @@ def _fill(out: Path, seed: int, config: StudioConfig, recipe: Recipe, show: Call
     (run / CHECKPOINT).unlink(missing_ok=True)
     curve: list[tuple[int, float]] = []
 
-    def watch(progress: Progress) -> None:
-        if progress.step % 20 == 0 or progress.step == 1:
-            curve.append((progress.step, progress.psnr))
-        share = 0.12 + 0.62 * progress.step / progress.steps
-        show(share, f"training, step {progress.step} of {progress.steps}, {progress.psnr:.1f} dB")
+    def on_step(step: Progress) -> None:
+        if step.step % 20 == 0 or step.step == 1:
+            curve.append((step.step, step.psnr))
+        share = 0.12 + 0.62 * step.step / step.steps
+        progress(share, f"training, step {step.step} of {step.steps}, {step.psnr:.1f} dB")
 
-    avatar = train(capture, recipe, run, torch.device("cpu"), watch=watch)
+    avatar = train(capture, recipe, run, torch.device("cpu"), progress=on_step)
     lap("training")
 
-    show(0.74, "measuring")
+    progress(0.74, "measuring")
     metrics = evaluate(avatar, capture, run, most=9, meshes=2)
     lap("evaluation")
-    show(0.82, "drawing")
+    progress(0.82, "drawing")
     images = _images(avatar, capture, out)
     lap("pictures")
     if not missing_packages(EXPORT.config):
-        export(avatar, capture, out, EXPORT, lambda done, note: show(0.86 + 0.14 * done, note or "exporting"))
+        export(avatar, capture, out, EXPORT, lambda done, note: progress(0.86 + 0.14 * done, note or "exporting"))
         lap("export")
     seconds["total"] = time.monotonic() - begun
     metrics["seconds"] = {**seconds, "protocol": "wall-clock time of the parts of this demo on this machine"}
     write_json(out / "metrics.json", metrics)
     page = _page(out, seed, metrics, curve, images)
-    show(1.0, "done")
+    progress(1.0, "done")
     return page
 
 
@@ -147,7 +149,7 @@ def _images(avatar: Avatar, capture: Capture, out: Path) -> list[Path]:
     save_png(folder / "novel_pose.png", comparison(avatar, capture, _one_each(capture.splits["novel_pose"])))
     background = torch.tensor(capture.background)
     posed = pose_canonically(avatar)
-    parts = [panels(draw(avatar, posed, camera, background)) for camera in orbit(posed, 256, 2)]
+    parts = [panels(render_image(avatar, posed, camera, background)) for camera in orbit(posed, 256, 2)]
     save_png(folder / "canonical.png", sheet([list(p.values()) for p in parts], ["front", "back"], list(parts[0])))
     frame = capture.train[0]
     turning = orbit_frames(avatar, avatar.pose(frame.pose, frame.translation), capture, 256, 24, scene_up(capture))

@@ -80,8 +80,8 @@ def export(
     request = replace(request, motions=_motions(avatar, [word for word in motion if word not in _OWN], read))
     require_exportable(request, read)
     folder = out or run / "exports"
-    with bar("Exporting") as show:
-        written = write(avatar, read, folder, request, show, open_cache(run, read, tell))
+    with bar("Exporting") as progress:
+        written = write(avatar, read, folder, request, progress, open_cache(run, read, tell))
     names = ", ".join(path.name for path in written)
     say(f"{names} in {folder}.", "open it in Blender, three.js or a game engine; see docs/export.md")
 

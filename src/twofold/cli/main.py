@@ -27,6 +27,7 @@ from twofold.errors import TwofoldError
 if TYPE_CHECKING:
     from twofold.methods.base import Avatar
     from twofold.recipe import Recipe
+    from twofold.training.loop import Progress
 
 Parts = Literal["all", "orbit", "views", "poses", "canonical"]
 
@@ -79,10 +80,10 @@ def train(
     require(validate(source), source)
     read = read_capture(source)
     try:
-        with bar("Training") as show:
+        with bar("Training") as progress:
             loop.train(
                 read, chosen, folder, where, resume is not None,
-                lambda p: show(p.step / p.steps, f"step {p.step}  loss {sum(p.losses.values()):.4f}  {p.psnr:.1f} dB"),
+                lambda p: progress(p.step / p.steps, _note(p)),
                 _attach_perceptual,
                 lambda avatar, step: save_preview(avatar, read, folder, step),
                 lambda note: console().print(note, soft_wrap=True),
@@ -96,6 +97,10 @@ def train(
         raise KeyboardInterrupt(f"The training continues with: {shlex.join(words)}") from None
     moved = capture if resume else None
     say(f"The avatar is in {folder}.", _with_capture(["twofold", "render", str(folder)], moved))
+
+
+def _note(done: "Progress") -> str:
+    return f"step {done.step}  loss {sum(done.losses.values()):.4f}  {done.psnr:.1f} dB"
 
 
 def _show_settings(recipe: str, overrides: tuple[str, ...], seed: int) -> None:
@@ -174,8 +179,8 @@ def render(
     read = read_capture(source)
     require_same(run, read, motion=False)
     folder = out or run / "renders"
-    with made_folder(folder), bar("Rendering") as show:
-        render_run(avatar, read, folder, what, size, chunk, lambda done: show(done, ""))
+    with made_folder(folder), bar("Rendering") as progress:
+        render_run(avatar, read, folder, what, size, chunk, lambda done: progress(done, ""))
     measure = _with_capture(["twofold", "evaluate", str(run)], capture)
     say(f"The images are in {folder}.", after_rendering(run, source, measure, read_recipe(run).name))
 
@@ -216,8 +221,8 @@ def evaluate(
     require_capture(source)
     read = read_capture(source)
     require_same(run, read, motion=True)
-    with bar("Measuring") as show:
-        metrics = measure(avatar, read, run, images, meshes, show, networks=networks)
+    with bar("Measuring") as progress:
+        metrics = measure(avatar, read, run, images, meshes, progress, networks=networks)
     for section, values in metrics.items():
         if section.endswith("_protocols"):
             print_protocols(section, values)
@@ -248,8 +253,8 @@ def demo(out: Path = Path("demo"), seed: int = 0) -> None:
     """
     from twofold.cli.demo import run_demo
 
-    with bar("Demo") as show:
-        page = run_demo(out, seed, show)
+    with bar("Demo") as progress:
+        page = run_demo(out, seed, progress)
     say(f"The page is {page}.", f"open {page}, or train on your own: twofold train CAPTURE")
 
 

@@ -82,9 +82,9 @@ def motion(
     moved = read.motion if fps is not None or read.motion.fps <= 60 else resampled(read.motion, 60.0)
     path = out or Path(f"{moved.name}-preview.mp4")
     cameras = motion_cameras(shaped, moved, size, follow)
-    with bar("Rendering") as show:
+    with bar("Rendering") as progress:
         renderer = body_renderer(shaped, moved, color)
-        write_motion(path, moved.fps, cameras, renderer, color, progress=lambda done: show(done, ""))
+        write_motion(path, moved.fps, cameras, renderer, color, progress=lambda done: progress(done, ""))
     say(f"The preview is {path}.", f"twofold render RUN --motion {source}")
 
 
@@ -132,8 +132,15 @@ def render_motion(
             renderer = mesh_renderer(avatar, trained_on, read.motion, progress=progress, cache=cache)
     else:
         renderer = field_renderer(avatar, read.motion, chunk)
-    with bar("Rendering") as show:
+    with bar("Rendering") as progress:
         write_motion(
-            path, read.motion.fps, cameras, renderer, color, shown.alpha, lambda done: show(done, ""), path == default
+            path,
+            read.motion.fps,
+            cameras,
+            renderer,
+            color,
+            shown.alpha,
+            lambda done: progress(done, ""),
+            path == default,
         )
     say(f"The motion is in {path}.", f"twofold export {run} --motion {shown.motion}")

@@ -10,7 +10,7 @@ _LOOKED_AT = 8
 """Training images looked at, evenly spread."""
 _APART = 3
 """Pixels from the mask from which a pixel counts as background."""
-_LEAST_CHANGE = 2
+_MIN_CHANGE = 2
 """Values out of 255 by which colours differ that are not one colour with the noise of a compressed file."""
 
 
@@ -23,7 +23,7 @@ def require_backdrop(capture: Capture) -> None:
     for frame in spread(capture.train, _LOOKED_AT):
         away = np.asarray(ndimage.distance_transform_edt(frame.mask().numpy() == 0))
         outside = frame.image().numpy()[away > _APART]
-        if len(outside) and np.ptp(np.percentile(outside, (1, 99), axis=0), axis=0).max() * 255 > _LEAST_CHANGE:
+        if len(outside) and np.ptp(np.percentile(outside, (1, 99), axis=0), axis=0).max() * 255 > _MIN_CHANGE:
             return
     raise TwofoldError(
         f"{capture.folder} shows one colour behind the person, as if the background had been removed, and vid2avatar "

@@ -70,7 +70,7 @@ def named_frames(capture: Capture, times: tuple[int, ...]) -> list[Frame]:
     """
     found: dict[int, Frame] = {}
     for frame in capture.train:
-        found.setdefault(frame.time, frame)
+        found.setdefault(frame.frame_index, frame)
     for time in times:
         if time not in found:
             known = sorted(found)

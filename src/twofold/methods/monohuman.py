@@ -20,11 +20,11 @@ from twofold.losses import CONSISTENT_LIKELIHOOD, deformation_consistency
 from twofold.methods.base import EVALUATION, Batch, MethodConfig, Mode, Rendering
 from twofold.methods.key_frames import MIN_SIDE, read_key_frames
 from twofold.methods.skeletal import Posed, SkeletalAvatar, aligned
-from twofold.methods.skeletal_config import MOST_STEPS, SkeletalConfig, SkeletalRates, affordable
+from twofold.methods.skeletal_config import MAX_STEPS, SkeletalConfig, SkeletalRates, affordable
 from twofold.methods.subject import Subject
 from twofold.recipe import PixelConfig, Recipe, TrainingConfig
 
-MOST_SIDE = 16_384
+MAX_SIDE = 16_384
 """Of a stored key frame's image, pixels."""
 MIN_DEPTH = 1e-6
 """Depths closer to zero than this are not divided by, metres."""
@@ -50,7 +50,7 @@ class MonoHumanConfig(MethodConfig):
 
     def __post_init__(self) -> None:
         """Refuses settings that nothing can be made of."""
-        require_within(self, key_frames=(0, MOST_STEPS), features_every=(1, MOST_STEPS), consistency=(0, 1e6))
+        require_within(self, key_frames=(0, MAX_STEPS), features_every=(1, MAX_STEPS), consistency=(0, 1e6))
         two = len(self.key_frames) in (0, 2)
         require(two, f"key_frames should be two frame indices or none, not {self.key_frames}")
 
@@ -107,7 +107,7 @@ class MonoHumanAvatar(SkeletalAvatar):
     def load_stored(self, state: dict[str, Tensor]) -> None:
         """See `Avatar.load_stored`: takes on the size of the key frames' images."""
         images = state.get("key_images")
-        if images is not None and images.ndim == 4 and MIN_SIDE <= min(images.shape[2:]) <= MOST_SIDE:
+        if images is not None and images.ndim == 4 and MIN_SIDE <= min(images.shape[2:]) <= MAX_SIDE:
             self.key_images = torch.zeros(2, 3, *images.shape[2:], dtype=torch.uint8, device=self.device)
 
     def pose(

@@ -116,7 +116,7 @@ class NpcAvatar(BoxedAvatar[Shared]):
             TwofoldError: there is no such surface, or too little of it in a part.
         """
         if stage == 1:
-            cameras = [(f.time, f.camera) for f in capture.train]
+            cameras = [(f.frame_index, f.camera) for f in capture.train]
             self.begin_points(self.find_positions(), generator, len(cameras))
             rows = torch.stack([torch.cat([c.world_to_camera, _intrinsics(c.intrinsics)]) for _, c in cameras])
             sizes = torch.tensor([[time, c.width, c.height] for time, c in cameras])

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.config import require_within
-from twofold.losses import MOST_STEPS
+from twofold.losses import MAX_STEPS
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class PoseConfig:
 
     def __post_init__(self) -> None:
         """Refuses chances and steps that there are not."""
-        steps = (0, MOST_STEPS)
+        steps = (0, MAX_STEPS)
         require_within(self, zero_until=steps, zero_epochs=steps, zero_every=steps, drop=(0, 1), refine_from=steps)
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from twofold.config import require, require_within
 from twofold.volume.samples import Samples
 
-MOST_STEPS = 100_000_000
+MAX_STEPS = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class SkeletalConfig:
         """Refuses settings that nothing can be made of."""
         require_within(
             self, samples=(2, 4096), min_likelihood=(0, 1), volume_channels=(1, 8192), volume_code=(1, 8192),
-            volume_every=(1, MOST_STEPS), correct_from=(0, MOST_STEPS), motion_from=(0, MOST_STEPS),
-            motion_full=(1, MOST_STEPS), squared_error=(0, 1e6), lpips=(0, 1e6), guard_steps=(1, MOST_STEPS),
+            volume_every=(1, MAX_STEPS), correct_from=(0, MAX_STEPS), motion_from=(0, MAX_STEPS),
+            motion_full=(1, MAX_STEPS), squared_error=(0, 1e6), lpips=(0, 1e6), guard_steps=(1, MAX_STEPS),
             guard_frames=(1, 10_000), guard_size=(8, 100_000), level_density=(1e-3, 1e6),
         )  # fmt: skip
         require(1 <= len(self.volume_channels) <= 7, "volume_channels should be one to seven numbers")

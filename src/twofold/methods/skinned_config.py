@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from twofold.config import require, require_within
 from twofold.field.output import FieldOutput
-from twofold.losses import MOST_STEPS, LossConfig
+from twofold.losses import MAX_STEPS, LossConfig
 from twofold.methods.base import MethodConfig
 from twofold.methods.pose_schedule import PoseConfig
 from twofold.sampling.error_bounded import ErrorBoundedSampler
@@ -54,8 +54,8 @@ class SkinnedConfig(MethodConfig):
     def __post_init__(self) -> None:
         """Refuses options that exclude each other."""
         require_within(
-            self, neighbours=(1, 64), late_neighbours=(1, 64), late_from=(1, MOST_STEPS),
-            shell_refresh=(1, MOST_STEPS), outlier_distance=(0.001, 10), beta=(0, 10),
+            self, neighbours=(1, 64), late_neighbours=(1, 64), late_from=(1, MAX_STEPS),
+            shell_refresh=(1, MAX_STEPS), outlier_distance=(0.001, 10), beta=(0, 10),
         )  # fmt: skip
         require(0 < self.beta_floor < self.beta, f"beta_floor should lie between 0 and beta={self.beta}")
 

@@ -36,14 +36,14 @@ class Subject:
     @staticmethod
     def of(capture: Capture) -> "Subject":
         """The subject of a capture's training frames."""
-        moments = {frame.time: frame for frame in capture.train}
-        frames = [moments[time] for time in sorted(moments)]
+        frames_by_index = {frame.frame_index: frame for frame in capture.train}
+        frames = [frames_by_index[time] for time in sorted(frames_by_index)]
         middle = torch.stack([f.translation + capture.body.joints[0] for f in frames]).mean(0)
         away = max(float((f.camera.center - middle).norm()) for f in frames)
         return Subject(
             body=capture.body,
             betas=capture.betas,
-            times=torch.tensor([f.time for f in frames]),
+            times=torch.tensor([f.frame_index for f in frames]),
             poses=torch.stack([f.pose for f in frames]),
             translations=torch.stack([f.translation for f in frames]),
             scene_scale=3 / (1.1 * away),

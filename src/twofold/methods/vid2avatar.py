@@ -172,7 +172,7 @@ class Vid2Avatar(SkinnedAvatar[Vid2AvatarConfig, ImplicitField]):
             middle = self._middle(row)
             for frame in capture.train:
                 away = float((frame.camera.center - middle).norm()) * self.subject.scene_scale
-                if frame.time == time and away >= RADIUS:
+                if frame.frame_index == time and away >= RADIUS:
                     raise TwofoldError(
                         f"The camera {frame.camera_name} is outside the sphere around the body at frame {time}, where "
                         "the background begins; train with --set method.center=world."
@@ -236,7 +236,7 @@ class Vid2Avatar(SkinnedAvatar[Vid2AvatarConfig, ImplicitField]):
         if self.scene is not None:
             origins = self._from_middle(rays, posed)
             far = sphere_exit(origins, rays.directions) / self.subject.scene_scale
-            rays = Rays(rays.origins, rays.directions, torch.zeros_like(rays.near), far.clamp_min(_LEAST_FAR))
+            rays = Rays(rays.origins, rays.directions, torch.zeros_like(rays.near), far.clamp_min(_MIN_FAR))
             background = self.scene_color(rays, posed, generator) if background is None else background
         behind = torch.zeros(3, device=self.device) if background is None else background
         placed = self.place(rays, posed, mode, generator)
@@ -323,5 +323,5 @@ _SCENE_SEED = 1_000_003
 """Added to the seed for the scene's weights, so that they are not the person's."""
 _SURFACE_REACH = 0.2
 """How far from the body the canonical surface is looked for, metres."""
-_LEAST_FAR = 1e-3
+_MIN_FAR = 1e-3
 """Rays of cameras outside of the sphere that miss it end here, metres."""

@@ -23,7 +23,7 @@ from twofold.metrics.perceptual import LPIPS, Network, load_lpips, lpips_cell
 Region = Literal["whole", "box", "mask"]
 """Of the image, of the true mask's bounding box, of the true mask."""
 Color = tuple[float, float, float]
-LEAST_SIDE = 31
+MIN_SIDE = 31
 """Pixels that AlexNet needs along each side; VGG16 is content with fewer."""
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
@@ -154,9 +154,9 @@ def measure_setting(
     row["ssim"] = ssim(x, y, setting.data_range, None, setting.window, where, setting.truncate)
     if network is not None:
         x, y, _ = region("whole" if setting.ssim_region == "whole" else "box")
-        if min(x.shape[:2]) < LEAST_SIDE:
+        if min(x.shape[:2]) < MIN_SIDE:
             have = f"{x.shape[0]} x {x.shape[1]}"
-            raise TwofoldError(f"LPIPS needs {LEAST_SIDE} x {LEAST_SIDE} pixels, it got {have}; use larger images.")
+            raise TwofoldError(f"LPIPS needs {MIN_SIDE} x {MIN_SIDE} pixels, it got {have}; use larger images.")
         stored = [to_8bit(p, setting.truncate).movedim(-1, 0)[None].float() / 255 for p in (x, y)]
         if setting.unscaled:
             stored = [(p + 1) / 2 for p in stored]  # The network itself maps 0..1 to -1..1.

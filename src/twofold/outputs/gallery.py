@@ -17,9 +17,9 @@ from twofold.files import plain_errors, write_atomically
 from twofold.methods.base import Avatar, PosedAvatar
 from twofold.metrics.image import subject_box
 from twofold.outputs.shares import Shares
-from twofold.outputs.sheets import as_bytes, color_normals, residual_picture, sheet
+from twofold.outputs.sheets import as_bytes, color_normals, residual_image, sheet
 from twofold.outputs.video import write_video
-from twofold.outputs.views import RenderedImage, draw, orbit, pose_canonically
+from twofold.outputs.views import RenderedImage, orbit, pose_canonically, render_image
 
 Item = TypeVar("Item")
 _ROWS = 5
@@ -39,7 +39,9 @@ def save_preview(avatar: Avatar, capture: Capture, folder: Path, step: int) -> N
     frame = capture.train[(step // 7) % len(capture.train)]
     height = min(256, frame.camera.height)
     camera = frame.camera.resized(height, round(frame.camera.width * height / frame.camera.height))
-    image = draw(avatar, avatar.pose(frame.pose, frame.translation, frame.time), camera, _background(capture))
+    image = render_image(
+        avatar, avatar.pose(frame.pose, frame.translation, frame.frame_index), camera, _background(capture)
+    )
     true = Image.fromarray(as_bytes(frame.image())).resize((camera.width, height), Image.Resampling.BOX)
     parts = [np.asarray(true), *(panels(image)[name] for name in ("full", "normals"))]
     save_png(folder / "previews" / f"{step:06d}.png", np.concatenate(parts, 1))
@@ -54,7 +56,7 @@ def panels(image: RenderedImage) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
     parts = {
         "full": image.color,
         "base": image.base,
-        "residual": residual_picture(image.color, image.base),
+        "residual": residual_image(image.color, image.base),
         "normals": color_normals(image.normal, image.opacity),
         "base normals": color_normals(image.base_normal, image.opacity),
         "opacity": image.opacity,
@@ -68,7 +70,7 @@ def beside_truth(
     """A frame's own image on the background, and the avatar's."""
     background = _background(capture)
     posed = avatar.pose(frame.pose, frame.translation)
-    image = draw(avatar, posed, frame.camera, background, chunk)
+    image = render_image(avatar, posed, frame.camera, background, chunk)
     return as_bytes(shown_truth(frame, background)), image
 
 
@@ -94,7 +96,7 @@ def comparison(
         columns = list(parts)
         where = _around(frame.mask())
         rows.append([part[where] for part in parts.values()])
-        labels.append(f"{frame.camera_name} {frame.time}")
+        labels.append(f"{frame.camera_name} {frame.frame_index}")
         if drawn:
             drawn()
     return sheet(rows, labels, columns)
@@ -111,7 +113,7 @@ def orbit_frames(
 ) -> Iterator[RenderedImage]:  # fmt: skip
     """Images from all around."""
     for camera in orbit(posed, size, views, up):
-        yield draw(avatar, posed, camera, _background(capture), chunk)
+        yield render_image(avatar, posed, camera, _background(capture), chunk)
 
 
 def scene_up(capture: Capture) -> Float[Tensor, "3"]:
@@ -124,20 +126,20 @@ def motion_frames(
     avatar: Avatar, capture: Capture, split: str, size: int, chunk: int | None = None
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """A split's poses one after the other from one fixed camera, full beside base."""
-    moments = {frame.time: frame for frame in reversed(capture.splits[split])}
+    frames_by_index = {frame.frame_index: frame for frame in reversed(capture.splits[split])}
     camera = None
-    for time in sorted(moments):
-        frame = moments[time]
+    for time in sorted(frames_by_index):
+        frame = frames_by_index[time]
         height = min(size, frame.camera.height)
         camera = camera or frame.camera.resized(height, round(frame.camera.width * height / frame.camera.height))
         posed = avatar.pose(frame.pose, frame.translation)
-        image = draw(avatar, posed, camera, _background(capture), chunk)
+        image = render_image(avatar, posed, camera, _background(capture), chunk)
         yield np.concatenate([as_bytes(image.color), as_bytes(image.base)], 1)
 
 
 def render_run(
     avatar: Avatar, capture: Capture, folder: Path, what: str, size: int, chunk: int | None,
-    show: Callable[[float], None], views: int = 24,
+    progress: Callable[[float], None], views: int = 24,
 ) -> None:  # fmt: skip
     """Draws everything, or one part, into a folder.
 
@@ -148,7 +150,7 @@ def render_run(
         what: "all", "orbit", "views", "poses" or "canonical".
         size: edge of orbit and canonical images, pixels.
         chunk: rays at once; None as many as memory allows.
-        show: called with the fraction that is done.
+        progress: called with the fraction that is done.
         views: images of the orbit.
 
     Raises:
@@ -161,7 +163,7 @@ def render_run(
             "draw the orbit or the canonical pose instead."
         )
     background = _background(capture)
-    shares = Shares(*_pieces(capture, what, size, views), show)
+    shares = Shares(*_pieces(capture, what, size, views), progress)
 
     def counted(kind: str, images: Iterable[Item]) -> Iterator[Item]:
         for image in images:
@@ -170,7 +172,7 @@ def render_run(
 
     if what in ("all", "canonical"):
         posed = pose_canonically(avatar)
-        drawn = (draw(avatar, posed, camera, background, chunk) for camera in orbit(posed, size, 2))
+        drawn = (render_image(avatar, posed, camera, background, chunk) for camera in orbit(posed, size, 2))
         parts = [panels(image) for image in counted("canonical", drawn)]
         save_png(folder / "canonical.png", sheet([list(p.values()) for p in parts], ["front", "back"], list(parts[0])))
     for part, split in splits.items():
@@ -183,7 +185,7 @@ def render_run(
                 _write_film(folder / "novel_pose.mp4", counted("motion", moving))
     if what in ("all", "orbit"):
         frame = capture.train[0]
-        posed = avatar.pose(frame.pose, frame.translation, frame.time)
+        posed = avatar.pose(frame.pose, frame.translation, frame.frame_index)
 
         def turning() -> Iterator[np.ndarray]:
             images = orbit_frames(avatar, posed, capture, size, views, scene_up(capture), chunk)
@@ -198,12 +200,12 @@ def render_run(
 def _pieces(capture: Capture, what: str, size: int, views: int) -> tuple[dict[str, int], dict[str, float]]:
     """How many images of each kind `render_run` draws, and their sizes beside each other, pixels."""
     seen, posed = (capture.splits.get(split, ()) for split in ("novel_view", "novel_pose"))
-    moments = {frame.time: frame.camera for frame in posed}
+    frames_by_index = {frame.frame_index: frame.camera for frame in posed}
     counts = {
         "canonical": (2 if what in ("all", "canonical") else 0, size * size),
         "views": (min(len(seen), _ROWS) if what in ("all", "views") else 0, _pixels(seen)),
         "poses": (min(len(posed), _ROWS) if what in ("all", "poses") else 0, _pixels(posed)),
-        "motion": (len(moments) if what in ("all", "poses") else 0, min(_pixels(posed), size * size)),
+        "motion": (len(frames_by_index) if what in ("all", "poses") else 0, min(_pixels(posed), size * size)),
         "orbit": (views if what in ("all", "orbit") else 0, size * size),
     }
     return {name: count for name, (count, _) in counts.items()}, {

@@ -13,7 +13,7 @@ from twofold.outputs.export.bake import BakeConfig
 from twofold.outputs.export.bake_cache import BakeCache
 from twofold.outputs.export.character import Animation, Character, pose_character
 from twofold.outputs.export.make import bake
-from twofold.outputs.mesh_preview import as_tensor, draw_mesh
+from twofold.outputs.mesh_preview import as_tensor, render_mesh
 from twofold.outputs.motion_video import Renderer, View
 
 CONFIG = BakeConfig(faces=40_000, texture=1024, lit=True)
@@ -53,7 +53,7 @@ def clip_renderer(character: Character, clip: Animation) -> Renderer:
     def view(index: int, camera: Camera) -> View:
         weights = None if clip.weights is None else clip.weights[index]
         vertices = pose_character(character, clip.poses[index], clip.translations[index], weights)
-        image = draw_mesh(character, vertices, camera, np.zeros(3, dtype=np.float32))
+        image = render_mesh(character, vertices, camera, np.zeros(3, dtype=np.float32))
         return View(*as_tensor(image))
 
     return view

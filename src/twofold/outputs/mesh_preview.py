@@ -12,7 +12,7 @@ from twofold.outputs.export.character import Character, normals_of
 from twofold.outputs.raster_kernels import nearest_faces, project, shade
 
 
-def draw_mesh(
+def render_mesh(
     character: Character,
     vertices: Float[np.ndarray, "V 3"],
     camera: Camera,

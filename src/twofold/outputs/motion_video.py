@@ -19,7 +19,7 @@ from twofold.inputs import is_there
 from twofold.methods.base import Avatar
 from twofold.outputs.mesh_images import floor_image, mesh_image
 from twofold.outputs.video import write_alpha_video, write_video
-from twofold.outputs.views import draw
+from twofold.outputs.views import render_image
 
 VIDEO_ENDINGS = (".mp4", ".webm", ".mov")
 """Videos that are written; the last two can hold opacity."""
@@ -63,7 +63,7 @@ def field_renderer(avatar: Avatar, motion: Motion, chunk: int | None = None) -> 
     @torch.no_grad()
     def view(index: int, camera: Camera) -> View:
         posed = avatar.pose(motion.poses[index], motion.translations[index])
-        image = draw(avatar, posed, camera, torch.zeros(3), chunk)
+        image = render_image(avatar, posed, camera, torch.zeros(3), chunk)
         return View(image.color, image.opacity)
 
     return view

@@ -100,7 +100,7 @@ def color_normals(
     return 1 + opacity[..., None] * (0.5 * unit - 0.5)
 
 
-def residual_picture(
+def residual_image(
     full: Float[Tensor, "h w 3"], base: Float[Tensor, "h w 3"], gain: float = 1.0
 ) -> Float[Tensor, "h w 3"]:
     """What the detail branch adds to the base: grey where nothing, brighter or darker by `gain` times the change."""

@@ -50,7 +50,7 @@ def rays_at_once(device: torch.device) -> int:
 
 
 @torch.no_grad()
-def draw(
+def render_image(
     avatar: Avatar, posed: PosedAvatar, camera: Camera, background: Float[Tensor, "3"], chunk: int | None = None
 ) -> RenderedImage:
     """Renders an image; rays that miss the body's surroundings are background without being followed.
@@ -70,7 +70,7 @@ def draw(
     clipped, hit = clip_to_box(rays, low, high)
     wanted = hit.nonzero()[:, 0]
     pixels = camera.height * camera.width
-    out = torch.zeros(pixels, 15, device=device)
+    out = torch.zeros(pixels, 15, dtype=background.dtype, device=device)
     has_base = False
     out[:, :3], out[:, 8:11] = background, background
     for part in wanted.split(chunk or rays_at_once(device)):

@@ -45,7 +45,7 @@ from twofold.prepare.output.review import Agreement, compare_with_pictures
 from twofold.prepare.turning import arc, camera_directions
 from twofold.prepare.video.clips import Clip, PrepareConfig, advice, longer, open_clips, rate_of, require_options
 
-Show = Callable[[float, str], None]
+Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Prepared:
 
     def summary(self) -> str:
         """What came of it in a few words."""
-        moments = len({quality.time for quality in self.qualities})
+        moments = len({quality.frame_index for quality in self.qualities})
         return (
             f"{len(self.kept)} of {moments} frames, silhouette IoU {self.mean('iou'):.2f}, landmarks off by "
             f"{self.mean('reprojection'):.1f} pixels ({self.mean('reprojection_percent'):.1f} % of the body's height)."
@@ -79,7 +79,7 @@ class Prepared:
         """How much of the masks was taken for held objects."""
         if not self.objects:
             return ""
-        images = sum(quality.time in set(self.kept) for quality in self.qualities)
+        images = sum(quality.frame_index in set(self.kept) for quality in self.qualities)
         return (
             f" Held objects were taken out in {len(self.objects)} of {images} images, at most "
             f"{100 * max(self.objects):.1f} % and on average {100 * sum(self.objects) / max(images, 1):.1f} % of the "
@@ -89,7 +89,7 @@ class Prepared:
     def mean(self, what: Literal["iou", "reprojection", "reprojection_percent"]) -> float:
         """Over the images of the frames that are kept."""
         kept = set(self.kept)
-        return float(np.mean([getattr(q, what) for q in self.qualities if q.time in kept]))
+        return float(np.mean([getattr(q, what) for q in self.qualities if q.frame_index in kept]))
 
 
 def prepare(
@@ -98,7 +98,7 @@ def prepare(
     body: Body,
     estimator: Callable[[], Estimator],
     config: PrepareConfig | None = None,
-    show: Show | None = None,
+    progress: Progress | None = None,
     people: Callable[[Sequence[UInt8[np.ndarray, "h w 3"]]], People] | None = None,
     overwrite: bool = False,
     finder: Finder = people_finder,
@@ -111,7 +111,7 @@ def prepare(
         body: to fit.
         estimator: makes a new estimator for each clip.
         config: options.
-        show: called with the fraction that is done and what is being done.
+        progress: called with the fraction that is done and what is being done.
         people: counts who is in view; None to trust that it is one person.
         overwrite: a capture that lies at `out` is overwritten.
         finder: finds everybody in an image, where one of several people is chosen.
@@ -120,7 +120,7 @@ def prepare(
         TwofoldError: a clip cannot be read or cannot work, the calibration does not go with the clips, or `out` cannot
             be written; nothing is left behind then.
     """
-    config, show = config or PrepareConfig(), show or (lambda done, what: None)
+    config, progress = config or PrepareConfig(), progress or (lambda done, what: None)
     require_options(clips, config)
     # The writer stands first, so that a place that cannot be written is known before any work.
     with (
@@ -129,15 +129,15 @@ def prepare(
     ):  # fmt: skip
         ready = open_clips(clips, config)
         given = read_given(ready, config, body)
-        watched, remarks = _watch_all(ready, given, Path(scratch), estimator, finder, body, config, show)
+        watched, remarks = _watch_all(ready, given, Path(scratch), estimator, finder, body, config, progress)
         chosen = any(piece is not None for piece in (config.person, config.masks, config.landmarks, config.poses))
         if people is not None and config.several_people == "refuse" and not chosen:
             for clip, seen in zip(ready, watched, strict=True):
                 require_one_person(people(seen.sample), clip.path)
-        found = _fit_all(ready, given, watched, body, config, show, remarks)
-        agreed = _judge_all(found, body, config, show)
+        found = _fit_all(ready, given, watched, body, config, progress, remarks)
+        agreed = _judge_all(found, body, config, progress)
         prepared = _write(writer, out, found, agreed, body, config)
-    show(1.0, "done")
+    progress(1.0, "done")
     return prepared
 
 
@@ -172,7 +172,7 @@ def _watch_all(
     finder: Finder,
     body: Body,
     config: PrepareConfig,
-    show: Show,
+    progress: Progress,
 ) -> tuple[list[Watched], list[str]]:
     """What is seen in each clip at the steps of time that all show, and sentences for the user."""
     watched: list[Watched] = []
@@ -185,7 +185,7 @@ def _watch_all(
                 seen = watch_clip(
                     clip.frames, clip.info.frames, found, scratch / clip.name, undistort,
                     [] if own.masks is None else own.masks.readings(),
-                    lambda done, k=k: show(0.3 * (k + done) / len(ready), "looking at the images"), region,
+                    lambda done, k=k: progress(0.3 * (k + done) / len(ready), "looking at the images"), region,
                 )  # fmt: skip
         finally:
             found.close()
@@ -228,7 +228,7 @@ def _fit_all(
     watched: Sequence[Watched],
     body: Body,
     config: PrepareConfig,
-    show: Show,
+    progress: Progress,
     remarks: list[str],
 ) -> _Found:
     seconds = np.array(watched[0].seconds)
@@ -242,7 +242,7 @@ def _fit_all(
         if piece.landmarks and config.landmarks is not None:
             own[k], sentence = chosen_landmarks(piece, seen.track, seen.sources, config.landmarks)
             remarks += [sentence] if sentence else []
-    show(0.3, "telling left from right")
+    progress(0.3, "telling left from right")
     if len(tracks) > 1:
         repairs = repair_with_views(tracks, calibrated, seconds)
         tracks = [o or repair.track for o, repair in zip(own, repairs, strict=True)]
@@ -261,7 +261,7 @@ def _fit_all(
     else:
         motion = fit(
             body, evidence, fps, free, points_in_space=in_space,
-            watch=lambda done: show(0.3 + 0.4 * done, "fitting the body"),
+            progress=lambda done: progress(0.3 + 0.4 * done, "fitting the body"),
         ).settled(body)  # fmt: skip
     scaled = [longer(camera, float(motion.log_focal.exp())) for camera in cameras]
     swapped = {c.name: np.flatnonzero(r.swapped).tolist() for c, r in zip(ready, repairs, strict=True)}
@@ -271,14 +271,14 @@ def _fit_all(
     return _Found(motion, cameras, watched, fps, swapped, config.calibration is not None, remarks)
 
 
-def _judge_all(found: _Found, body: Body, config: PrepareConfig, show: Show) -> list[Agreement]:
+def _judge_all(found: _Found, body: Body, config: PrepareConfig, progress: Progress) -> list[Agreement]:
     agreed: list[Agreement] = []
     count = len(found.cameras)
     for k, (name, camera) in enumerate(found.cameras.items()):
         standing = _standing(found.motion, body, camera)
         agreement = compare_with_pictures(
             name, camera, found.watched[k], body, found.motion, standing, config.held_objects, count == 1,
-            lambda done, k=k: show(0.7 + 0.28 * (k + done) / count, "judging the fit"),
+            lambda done, k=k: progress(0.7 + 0.28 * (k + done) / count, "judging the fit"),
         )  # fmt: skip
         require_whole(agreement.qualities, name, advice(config, FARTHER, ("landmarks",)))
         agreed.append(agreement)

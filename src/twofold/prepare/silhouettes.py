@@ -7,10 +7,10 @@ from torch import Tensor
 from twofold.geometry.cameras import Camera
 from twofold.geometry.raster import rasterize
 
-LEAST_IOU = 0.7
+MIN_IOU = 0.7
 """A frame whose silhouette overlaps its mask by less is fitted badly: limbs are somewhere else. Measured on real
 clips, failed fits lie well below."""
-MOST_BAD = 0.3
+MAX_BAD = 0.3
 """With a larger share of bad frames the rest cannot outvote them."""
 
 

@@ -68,7 +68,7 @@ class Look:
     eye_color: Color
 
 
-def draw_look(seed: int) -> Look:
+def sample_look(seed: int) -> Look:
     """The look of person `seed`; neighbouring seeds differ in shirt and hair style."""
     random = np.random.default_rng([seed, 1])
     shirt = SHIRTS[seed % len(SHIRTS)]

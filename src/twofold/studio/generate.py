@@ -21,12 +21,12 @@ from twofold.body.anny import anny_body
 from twofold.body.skeleton import Body, PosedBody, ShapedBody, pose_body, shape_body
 from twofold.body.stances import choreograph
 from twofold.capture.folder import CaptureWriter
-from twofold.config import MOST_SEED
+from twofold.config import MAX_SEED
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.raster import box_filter, rasterize, supersampled
 from twofold.geometry.surfaces import vertex_normals
-from twofold.studio.appearance import Look, draw_look
+from twofold.studio.appearance import Look, sample_look
 from twofold.studio.figure import Figure, build_figure
 from twofold.studio.lighting import Beads, cast_shade, illuminate, thread_beads
 from twofold.studio.scene import degrade_mask, ring, room
@@ -61,7 +61,7 @@ class StudioConfig:
 
     def __post_init__(self) -> None:
         limits = {
-            "seed": (0, MOST_SEED),
+            "seed": (0, MAX_SEED),
             "size": (16, 4096),
             "frames": (4, 100_000),
             "cameras": (1, 100),
@@ -125,7 +125,7 @@ def cast(seed: int, rehearsed: int, unrehearsed: int) -> Performer:
     random = np.random.default_rng([seed, 0])
     betas = torch.from_numpy(random.normal(0, 0.9, body.shape_basis.shape[-1]).clip(-1.8, 1.8).astype(np.float32))
     shaped = shape_body(body, betas)
-    look = draw_look(seed)
+    look = sample_look(seed)
     figure = build_figure(shaped, look)
     poses, sway = choreograph(seed, rehearsed, unrehearsed)
     poses = poses.astype(np.float32)

@@ -43,7 +43,7 @@ from twofold.training.run import (
     write_checkpoint,
 )
 
-MOST_RESTARTS = 5
+MAX_RESTARTS = 5
 """Times that a training may begin again by itself."""
 ROW_EVERY = 20
 """Steps between two rows of the curves."""
@@ -53,7 +53,7 @@ NOTHING_COMPILED = "This recipe has no dense networks, so training.compile chang
 
 @dataclass(frozen=True)
 class Progress:
-    """What the loop tells whoever watches: steps done and to do, losses, PSNR over the step's rays (dB)."""
+    """The state after a step: steps done and to do, losses, PSNR over the step's rays (dB)."""
 
     step: int
     steps: int
@@ -86,7 +86,7 @@ class Step(nn.Module):
             frame = self.source.frames[which]
             batch = self.source.draw(which, generator, self.color.device)
             batch = batch.against(self.avatar.background(self.color, len(batch.rays), generator))
-            posed = self.avatar.pose(frame.pose, frame.translation, frame.time, mode)
+            posed = self.avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
             rendering = self.avatar.render(batch.rays, posed, batch.background, mode, generator)
             for name, term in self.avatar.losses(rendering, batch, posed, mode, generator).items():
                 terms[name] = terms.get(name, 0) + term / images
@@ -157,7 +157,7 @@ def wants_compiling(config: TrainingConfig, device: torch.device) -> bool:
 
 def train(
     capture: Capture, recipe: Recipe, folder: Path, device: torch.device, resume: bool = False,
-    watch: Callable[[Progress], None] | None = None, before_first: Callable[[Avatar], str | None] | None = None,
+    progress: Callable[[Progress], None] | None = None, before_first: Callable[[Avatar], str | None] | None = None,
     preview: Callable[[Avatar, int], None] | None = None, say: Callable[[str], None] | None = None,
 ) -> Avatar:  # fmt: skip
     """Trains an avatar and leaves it in `folder`.
@@ -168,7 +168,7 @@ def train(
         folder: the run; new, or an interrupted one with `resume`.
         device: where.
         resume: continue from the folder's checkpoint (from the start where there is none yet).
-        watch: called after every step.
+        progress: called after every step.
         before_first: called with the new avatar, to attach what is no part of a recipe (perceptual networks); what it
             has to say is noted in the run.
         preview: called with the avatar and the steps done, from time to time.
@@ -223,8 +223,8 @@ def train(
                     say(f"The training started again at step {done}, from other initial weights: nothing was visible.")
                 continue
             if curves is not None:
-                if watch:
-                    watch(report)
+                if progress:
+                    progress(report)
                 if done % ROW_EVERY == 0 or done == steps:
                     curves.add({"step": float(done), **report.losses, "psnr": report.psnr, **avatar.scalars()})
                     require_finite(avatar.state_dict(), folder, done)
@@ -344,9 +344,9 @@ class _Run:
             TwofoldError: it has done so too often.
         """
         self.restarts += 1
-        if self.restarts > MOST_RESTARTS:
+        if self.restarts > MAX_RESTARTS:
             raise TwofoldError(
-                f"The training of {self.folder} showed nothing {MOST_RESTARTS} times; check the masks and poses of the "
+                f"The training of {self.folder} showed nothing {MAX_RESTARTS} times; check the masks and poses of the "
                 "capture with `twofold check`, or choose another --seed."
             )
         self.step = 0

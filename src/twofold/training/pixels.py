@@ -182,7 +182,7 @@ class PixelSource:
             patch_pixels=patches.to(device),
             patch_image=patch_image.to(device),
             patch_mask=patch_mask.to(device),
-            frame_index=self.frames[which].time,
+            frame_index=self.frames[which].frame_index,
         )
 
     def _choose(self, pool: int, count: int, generator: torch.Generator) -> Tensor:

@@ -45,8 +45,8 @@ def test_character_is_closed_and_has_about_the_triangles_asked_for(baked: Baked)
 
 def test_surface_lies_on_the_avatars_own_in_every_training_pose(baked: Baked, avatar: Avatar, person: Capture) -> None:
     for frame in person.train[1::2]:
-        posed = avatar.pose(frame.pose, frame.translation, frame.time)
-        there = still(baked, frame.time)
+        posed = avatar.pose(frame.pose, frame.translation, frame.frame_index)
+        there = still(baked, frame.frame_index)
         with torch.no_grad():
             x, _ = avatar.to_canonical(torch.from_numpy(there.vertices), posed)
             assert avatar.level(x, posed).abs().median() < 1e-3

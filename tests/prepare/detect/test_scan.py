@@ -130,7 +130,7 @@ def clip_frames(count, step=0, alive=None, every=1):
 def test_images_masks_and_landmarks_are_put_aside(tmp_path):
     finder, told = Finder(), []
     given = list(clip_frames(6, every=3))
-    seen = watch_clip(iter(given), 6, finder, tmp_path / "a" / "b", show=told.append)
+    seen = watch_clip(iter(given), 6, finder, tmp_path / "a" / "b", progress=told.append)
     assert len(seen.images) == len(seen.masks) == len(seen.track) == 6
     assert seen.sources == (0, 3, 6, 9, 12, 15)
     assert told == pytest.approx([(k + 1) / 6 for k in range(6)])
@@ -182,7 +182,7 @@ def test_memory_holds_a_few_images_only(tmp_path):
     def count(done):
         most.append(sum(image() is not None for image in alive) + sum(mask() is not None for mask in finder.masks))
 
-    seen = watch_clip(clip_frames(60, alive=alive), 60, finder, tmp_path, show=count)
+    seen = watch_clip(clip_frames(60, alive=alive), 60, finder, tmp_path, progress=count)
     assert len(seen.sample) == 12
     # The sample, and the image at hand with its mask.
     assert max(most) <= 12 + 4
@@ -198,7 +198,7 @@ def test_a_camera_that_moves_is_noticed(tmp_path, step, least, most):
 
 def test_a_clip_of_unknown_length_is_gone_through(tmp_path):
     told = []
-    seen = watch_clip(clip_frames(5), 2, Finder(), tmp_path, show=told.append)
+    seen = watch_clip(clip_frames(5), 2, Finder(), tmp_path, progress=told.append)
     assert len(seen.images) == 5
     assert told[-1] == 1
 

@@ -67,19 +67,19 @@ def missed(body, found, camera, track):
 
 
 # What most landmarks are off by from where they really are.
-MOST_NOISE = NOISE * np.sqrt(-2 * np.log(0.2))
+MAX_NOISE = NOISE * np.sqrt(-2 * np.log(0.2))
 
 
 def test_two_calibrated_cameras_find_the_body_to_centimetres():
     body = the_body("anny" if needs_anny.args[0] is False else "sausages")
     truth, views, told = acted(body, 6), cameras(0.4, 2.1), []
     evidence = [evidence_of(body, truth, view, noise=NOISE, seed=k) for k, view in enumerate(views)]
-    found = fit(body, evidence, FPS, watch=told.append)
+    found = fit(body, evidence, FPS, progress=told.append)
     # Better than any one landmark tells: a pixel is 5 mm there, and most are up to 14 mm off.
     assert worst(away(body, found, truth)) < 0.013
     for view, one in zip(views, evidence, strict=True):
         assert np.median(overlap(silhouettes(body, found, view), one.masks)) > 0.94
-        assert most(missed(body, found, view, one.track)) < MOST_NOISE
+        assert most(missed(body, found, view, one.track)) < MAX_NOISE
     assert abs(float(found.betas[0] - truth.betas[0])) < 0.15
     # Calibrated cameras leave nothing to guess.
     assert float(found.log_focal) == float(found.log_distance) == 0
@@ -96,7 +96,7 @@ def test_one_camera_finds_what_it_can_see():
     found = fit(body, [evidence], FPS).settled(body)
     assert float(found.log_focal) == 0
     assert np.median(overlap(silhouettes(body, found, view), evidence.masks)) > 0.94
-    assert most(missed(body, found, view, evidence.track)) < MOST_NOISE
+    assert most(missed(body, found, view, evidence.track)) < MAX_NOISE
     # Somebody taken for larger is taken to be farther away: this body's one coefficient is its size.
     hips = [joints_of(body, motion)[:, 0] for motion in (found, truth)]
     scale = float((hips[0].norm(dim=1) / hips[1].norm(dim=1)).median())
@@ -149,7 +149,7 @@ def test_the_number_of_threads_is_as_before(found):
     torch.set_num_threads(2)
     try:
         with nullcontext() if found else pytest.raises(TwofoldError):
-            fit(body, [evidence], FPS, config=QUICK, watch=lambda done: during.append(torch.get_num_threads()))
+            fit(body, [evidence], FPS, config=QUICK, progress=lambda done: during.append(torch.get_num_threads()))
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
@@ -234,7 +234,7 @@ def test_long_clips_are_fitted_window_by_window(short_windows, tmp_path):
         Image.fromarray(mask).save(file)
     track = landmarks(body, truth, view)
     track.visibility[8:16] = 1.0  # Most is seen in the second window, so that it tells the shape.
-    found = fit(body, [Evidence(view, track, files)], 20.0, watch=told.append)
+    found = fit(body, [Evidence(view, track, files)], 20.0, progress=told.append)
     assert len(found) == 24
     # Masks lie as files until their window comes: three windows, one of them first of all.
     windows = [tuple(int(path.stem) for path in masks) for masks in short_windows]
@@ -255,7 +255,7 @@ def test_windows_tell_the_distance_in_the_same_way(short_windows, monkeypatch):
     body = the_body()
     motion = replace(random_motion(body, 24, 0, size=0.2), log_distance=torch.zeros(()))
 
-    def window(body, evidence, fps, free_focal, config, space, known, watch):
+    def window(body, evidence, fps, free_focal, config, space, known, progress):
         times = evidence[0].track.world[:, 0, 0].astype(int)
         part = motion[slice(times[0], times[-1] + 1)]
         if known is not None:

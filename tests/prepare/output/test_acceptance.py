@@ -16,9 +16,9 @@ from twofold.geometry.cameras import Camera
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from twofold.prepare.detections import LANDMARKS, Track
 from twofold.prepare.output.acceptance import (
-    LEAST_VISIBILITY,
+    MAX_REPROJECTION,
     MIN_IMAGES,
-    MOST_REPROJECTION,
+    MIN_VISIBILITY,
     ImageQuality,
     image_quality,
     kept_times,
@@ -27,7 +27,7 @@ from twofold.prepare.output.acceptance import (
     require_whole,
     warnings_about,
 )
-from twofold.prepare.silhouettes import LEAST_IOU
+from twofold.prepare.silhouettes import MIN_IOU
 from twofold.prepare.turning import arc, camera_directions
 
 CAMERA = standing_camera()
@@ -43,7 +43,7 @@ def judged(iou=0.9, error=1.0, visibility=0.9, height=150.0, alone=True, **chang
 
 def test_a_good_image_has_no_fault():
     quality = judged(error=3.0)
-    assert quality == replace(quality, camera="cam", time=7, fault="", cropped=False)
+    assert quality == replace(quality, camera="cam", frame_index=7, fault="", cropped=False)
     assert quality.reprojection == pytest.approx(3)
     assert quality.reprojection_percent == pytest.approx(2)
     assert quality.visibility == pytest.approx(0.9)
@@ -52,9 +52,9 @@ def test_a_good_image_has_no_fault():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"iou": LEAST_IOU - 0.01}, "does not cover the mask (IoU 0.69, at least 0.7)"),
-        ({"error": 1.01 * MOST_REPROJECTION * 1.5}, "misses the landmarks (4.0 % of its height, at most 4 %)"),
-        ({"visibility": LEAST_VISIBILITY - 0.01}, "too little of the person is seen (visibility 0.49, at least 0.5)"),
+        ({"iou": MIN_IOU - 0.01}, "does not cover the mask (IoU 0.69, at least 0.7)"),
+        ({"error": 1.01 * MAX_REPROJECTION * 1.5}, "misses the landmarks (4.0 % of its height, at most 4 %)"),
+        ({"visibility": MIN_VISIBILITY - 0.01}, "too little of the person is seen (visibility 0.49, at least 0.5)"),
         ({"pixels": np.full((33, 2), np.nan)}, "nobody was found"),
     ],
 )
@@ -63,9 +63,9 @@ def test_bad_images_say_why(changes, words):
 
 
 def test_at_the_thresholds_images_stay():
-    assert not judged(iou=LEAST_IOU).fault
-    assert not judged(error=0.99 * MOST_REPROJECTION * 1.5).fault
-    assert not judged(visibility=LEAST_VISIBILITY + 0.01).fault
+    assert not judged(iou=MIN_IOU).fault
+    assert not judged(error=0.99 * MAX_REPROJECTION * 1.5).fault
+    assert not judged(visibility=MIN_VISIBILITY + 0.01).fault
 
 
 def test_where_other_cameras_see_the_person_landmarks_may_be_missed():
@@ -132,7 +132,7 @@ def test_clips_that_cut_the_person_off_are_refused():
 def records(faults, moments=20, cameras=("a", "b")):
     """Records of all images, with faults by (camera, time)."""
     return [
-        replace(GOOD, camera=camera, time=time, fault=faults.get((camera, time), ""))
+        replace(GOOD, camera=camera, frame_index=time, fault=faults.get((camera, time), ""))
         for camera in cameras
         for time in range(moments)
     ]

@@ -87,7 +87,9 @@ def test_nothing_of_a_synthetic_subject_is_an_object(tmp_path, mask_noise, off):
     capture = read_capture(tmp_path / "me")
     shaped = shape_body(capture.body, capture.betas)
     seen, colors, visible = [], [], []
-    frames = sorted({f.time: f for frames in capture.splits.values() for f in frames}.values(), key=lambda f: f.time)
+    frames = sorted(
+        {f.frame_index: f for frames in capture.splits.values() for f in frames}.values(), key=lambda f: f.frame_index
+    )
     for frame in frames:
         posed = pose_body(shaped, frame.pose, frame.translation + off)
         pixels, depth = project(frame.camera, posed.vertices)
@@ -101,6 +103,6 @@ def test_nothing_of_a_synthetic_subject_is_an_object(tmp_path, mask_noise, off):
     masks = [read_grey(frame.mask_file) for frame in frames]
     images = [read_rgb(frame.image_file) for frame in frames]
     found = [foreign_patches(m, i, s, *usual) for m, i, s in zip(masks, images, seen, strict=True)]
-    taken = moving_objects(found, [frame.time / capture.fps for frame in frames])
+    taken = moving_objects(found, [frame.frame_index / capture.fps for frame in frames])
     shares = [without(mask, patches)[2] for mask, patches in zip(masks, taken, strict=True)]
     assert np.mean(shares) < 0.005

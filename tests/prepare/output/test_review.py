@@ -41,10 +41,10 @@ def filmed(folder, motion=None, balls=()):
     return Watched(tuple(images), tuple(masks), track, times, tuple(t / 10 for t in times), times, 0.0, ())
 
 
-def compared(watched, motion=None, held="remove", alone=True, size=150.0, show=lambda done: None):
+def compared(watched, motion=None, held="remove", alone=True, size=150.0, progress=lambda done: None):
     body = the_body()
     return compare_with_pictures(
-        "cam", CAMERA, watched, body, motion or acted(body, MOMENTS), size, held, alone, show
+        "cam", CAMERA, watched, body, motion or acted(body, MOMENTS), size, held, alone, progress
     )  # fmt: skip
 
 
@@ -55,8 +55,8 @@ def read(path):
 
 def test_the_truth_agrees(tmp_path):
     told = []
-    agreement = compared(filmed(tmp_path / "a"), show=told.append)
-    assert [quality.time for quality in agreement.qualities] == list(range(MOMENTS))
+    agreement = compared(filmed(tmp_path / "a"), progress=told.append)
+    assert [quality.frame_index for quality in agreement.qualities] == list(range(MOMENTS))
     for quality in agreement.qualities:
         assert quality.camera == "cam"
         assert quality.iou > 0.999

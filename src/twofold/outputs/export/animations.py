@@ -20,7 +20,7 @@ WEIGHED = 60
 
 def capture_clip(baked: Baked, name: str = "capture") -> Animation:
     """The training motion in the capture's world, with the learned corrections of its poses."""
-    times = sorted({frame.time for frame in baked.capture.train})
+    times = sorted({frame.frame_index for frame in baked.capture.train})
     return _clip(baked, name, training_poses(baked.capture), np.array(times) / baked.capture.fps)
 
 

@@ -109,7 +109,7 @@ def open_cache(run: Path, capture: Capture, note: Callable[[str], None] = lambda
             raise TwofoldError(f"{run / name} cannot be read; train first, or name another run.") from error
     for frame in capture.train:
         camera = frame.camera
-        state.update(f"{frame.time} {camera.height} {camera.width}".encode())
+        state.update(f"{frame.frame_index} {camera.height} {camera.width}".encode())
         state.update(camera.world_to_camera.numpy().tobytes() + camera.intrinsics.numpy().tobytes())
     return BakeCache(run / FOLDER, state.hexdigest(), note)
 

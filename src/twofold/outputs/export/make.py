@@ -64,22 +64,22 @@ def frame_at(capture: Capture, index: int) -> Frame:
     """
     for split in ("train", *capture.splits):
         for frame in capture.splits.get(split, ()):
-            if frame.time == index:
+            if frame.frame_index == index:
                 return frame
-    known = sorted({frame.time for frames in capture.splits.values() for frame in frames})
+    known = sorted({frame.frame_index for frames in capture.splits.values() for frame in frames})
     raise TwofoldError(f"{capture.folder} has no frame {index}; its frames lie between {known[0]} and {known[-1]}.")
 
 
 def pose_of(capture: Capture, frame: Frame) -> Pose:
     """A frame's pose; one that was trained on takes its learned correction."""
-    trained = any(frame.time == other.time for other in capture.train)
-    return Pose(frame.pose, frame.translation, frame.time if trained else None)
+    trained = any(frame.frame_index == other.frame_index for other in capture.train)
+    return Pose(frame.pose, frame.translation, frame.frame_index if trained else None)
 
 
 def training_poses(capture: Capture) -> list[Pose]:
     """The poses of the training frames, in the order of time."""
-    moments = {frame.time: frame for frame in capture.train}
-    return [pose_of(capture, moments[time]) for time in sorted(moments)]
+    frames_by_index = {frame.frame_index: frame for frame in capture.train}
+    return [pose_of(capture, frames_by_index[time]) for time in sorted(frames_by_index)]
 
 
 def bake(
@@ -185,7 +185,7 @@ def _observed(
 ) -> Float[np.ndarray, "V"]:
     chosen = spread(frames, len(averaged))
     posed = {frame.frame_index: back.posed for frame, (_, back) in zip(chosen, averaged, strict=True)}
-    views = [(f.camera, posed[f.time].cpu().numpy()) for f in capture.train if f.time in posed]
+    views = [(f.camera, posed[f.frame_index].cpu().numpy()) for f in capture.train if f.frame_index in posed]
     return observed_share(faces, views)
 
 

@@ -75,7 +75,7 @@ def watch_clip(
     scratch: Path,
     undistort: Undistort | None = None,
     given: Sequence[Own] = (),
-    show: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
     region: Callable[[UInt8[np.ndarray, "h w 3"], int], Region | None] | None = None,
 ) -> Watched:
     """Looks at every image of a clip. One that equals the one before it, as stretched videos have them, is left out.
@@ -88,7 +88,7 @@ def watch_clip(
         undistort: takes the lens's distortion out of an image.
         given: the user's own mask of an image by its `source`, None where there is none; taken as it is. Where several
             readings are given the estimator's masks are kept, to choose by (`with_masks`).
-        show: called with the fraction that is done.
+        progress: called with the fraction that is done.
         region: where the person is in an undistorted image with its `source`, None for anywhere. By default around
             the user's own mask; where an image has none, around the last one.
 
@@ -138,8 +138,8 @@ def watch_clip(
             sample.append(image)
         if number % max(1, expected // _VIEWS) == 0:
             views.append(surroundings_of(image, mask))
-        if show is not None:
-            show(min(1.0, (frame.index + 1) / max(expected, 1)))
+        if progress is not None:
+            progress(min(1.0, (frame.index + 1) / max(expected, 1)))
     if not images:
         raise TwofoldError("A clip without any image cannot be prepared; choose another.")
     places, seconds, steps = zip(*sources, strict=True)

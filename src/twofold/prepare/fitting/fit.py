@@ -65,7 +65,7 @@ def fit(
     free_focal: bool = False,
     config: FitConfig | None = None,
     points_in_space: Float[np.ndarray, "t 33 3"] | None = None,
-    watch: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> FittedMotion:
     """The body's shape and motion through a clip.
 
@@ -79,7 +79,7 @@ def fit(
         free_focal: the focal length of the one camera is a guess and is fitted too.
         config: weights.
         points_in_space: landmarks triangulated from several cameras, world, metres; NaN where unknown.
-        watch: called with the fraction that is done.
+        progress: called with the fraction that is done.
 
     Raises:
         TwofoldError: nobody was found in any frame.
@@ -89,7 +89,7 @@ def fit(
     torch.set_num_threads(1)
     try:
         return _fit(
-            body, evidence, fps, free_focal, config or FitConfig(), points_in_space, watch or (lambda done: None)
+            body, evidence, fps, free_focal, config or FitConfig(), points_in_space, progress or (lambda done: None)
         )
     finally:
         torch.set_num_threads(threads)
@@ -102,13 +102,13 @@ def _fit(
     free_focal: bool,
     config: FitConfig,
     points_in_space: Float[np.ndarray, "t 33 3"] | None,
-    watch: Callable[[float], None],
+    progress: Callable[[float], None],
 ) -> FittedMotion:
     moments = len(evidence[0].track)
     if not np.any([e.track.found for e in evidence]):
         raise TwofoldError("Nobody was found in any image; film one whole person, well lit, and try again.")
     if moments <= WINDOW + OVERLAP:
-        return _fit_window(body, evidence, fps, free_focal, config, points_in_space, None, watch)
+        return _fit_window(body, evidence, fps, free_focal, config, points_in_space, None, progress)
     starts = list(range(0, moments - OVERLAP, WINDOW))
     # The window in which most is seen tells shape and focal length best.
     seen = [sum(float(e[slice(s, s + WINDOW)].track.visibility.sum()) for e in evidence) for s in starts]
@@ -122,7 +122,7 @@ def _fit(
         parts.append(
             known if start == best else _fit_window(body, some, fps, False, config, space, known, lambda done: None)
         )
-        watch((number + 1) / len(starts))
+        progress((number + 1) / len(starts))
     return _joined(parts)
 
 
@@ -166,7 +166,7 @@ def _fit_window(
     config: FitConfig,
     points_in_space: Float[np.ndarray, "t 33 3"] | None,
     known: FittedMotion | None,
-    watch: Callable[[float], None],
+    progress: Callable[[float], None],
 ) -> FittedMotion:
     points = body_points(body)
     outlines = [None if e.masks is None else trace_outlines(e.masks) for e in evidence]
@@ -190,12 +190,12 @@ def _fit_window(
     # Directions in space first, so that no limb starts from the wrong side of the image plane.
     few = config.steps[0] // 3
     motion = _descend(body, motion, ("root", "pose", "translation"), everything(1.0, 4.0), few, config.rate)
-    watch(few / total)
+    progress(few / total)
     changing = ("root", "pose", "translation", *shared)
     for wide in (4.0, 2.0):
         half = (config.steps[0] - few) // 2
         motion = _descend(body, motion, changing, everything(config.direction_weight, wide), half, config.rate)
-    watch(config.steps[0] / total)
+    progress(config.steps[0] / total)
     masks = [(k, o) for k, o in enumerate(outlines) if o is not None]
     rounds = max(1, config.steps[1] // config.rematch) if masks else 0
     count = len(body.template)
@@ -216,7 +216,7 @@ def _fit_window(
             return loss
 
         motion = _descend(body, motion, changing, with_outlines, config.rematch, rate, decay=False)
-        watch((config.steps[0] + (number + 1) * config.rematch) / total)
+        progress((config.steps[0] + (number + 1) * config.rematch) / total)
     return motion
 
 

@@ -12,10 +12,10 @@ from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
 from twofold.prepare.detect.background import MOVING
 from twofold.prepare.detections import LANDMARKS, Track
-from twofold.prepare.silhouettes import LEAST_IOU, MOST_BAD
+from twofold.prepare.silhouettes import MAX_BAD, MIN_IOU
 from twofold.prepare.turning import FULL_TURN
 
-MOST_REPROJECTION, LEAST_VISIBILITY = 4.0, 0.5
+MAX_REPROJECTION, MIN_VISIBILITY = 4.0, 0.5
 """An image above, below these is left out: measured on real clips, failed fits lie well beyond."""
 
 MIN_IMAGES = 12
@@ -37,7 +37,7 @@ class ImageQuality:
 
     Attributes:
         camera: whose image.
-        time: which frame of the capture.
+        frame_index: which frame of the capture.
         iou: of the body's silhouette and the mask.
         reprojection: mean error of the landmarks that are seen, pixels.
         reprojection_percent: the same in percent of the person's height in the images.
@@ -47,7 +47,7 @@ class ImageQuality:
     """
 
     camera: str
-    time: int
+    frame_index: int
     iou: float
     reprojection: float
     reprojection_percent: float
@@ -96,12 +96,12 @@ def image_quality(
     fault = ""
     if not known.any():
         fault = "nobody was found"
-    elif mean < LEAST_VISIBILITY:
-        fault = f"too little of the person is seen (visibility {mean:.2f}, at least {LEAST_VISIBILITY})"
-    elif iou < LEAST_IOU:
-        fault = f"the body does not cover the mask (IoU {iou:.2f}, at least {LEAST_IOU})"
-    elif alone and percent > MOST_REPROJECTION:
-        fault = f"the body misses the landmarks ({percent:.1f} % of its height, at most {MOST_REPROJECTION:g} %)"
+    elif mean < MIN_VISIBILITY:
+        fault = f"too little of the person is seen (visibility {mean:.2f}, at least {MIN_VISIBILITY})"
+    elif iou < MIN_IOU:
+        fault = f"the body does not cover the mask (IoU {iou:.2f}, at least {MIN_IOU})"
+    elif alone and percent > MAX_REPROJECTION:
+        fault = f"the body misses the landmarks ({percent:.1f} % of its height, at most {MAX_REPROJECTION:g} %)"
     return ImageQuality(camera_name, time, iou, error, percent, mean, cropped, fault)
 
 
@@ -136,7 +136,7 @@ def require_person(track: Track, clip: str, advice: str = LARGER) -> None:
         TwofoldError: as said.
     """
     share = float(track.found.mean())
-    if share < 1 - MOST_BAD:
+    if share < 1 - MAX_BAD:
         found = "nobody" if share == 0 else f"a person in only {100 * share:.0f} % of the images"
         raise TwofoldError(f"{clip} shows {found}; {advice}.")
 
@@ -176,10 +176,10 @@ def kept_times(
     reasons = dict.fromkeys(drop, DROPPED)
     for quality in qualities:
         if quality.fault:
-            reasons.setdefault(quality.time, quality.fault)
-    times = sorted({quality.time for quality in qualities})
+            reasons.setdefault(quality.frame_index, quality.fault)
+    times = sorted({quality.frame_index for quality in qualities})
     faults = {time: reason for time, reason in reasons.items() if reason != DROPPED}
-    if len(faults) > MOST_BAD * len(times):
+    if len(faults) > MAX_BAD * len(times):
         example = min(faults)
         raise TwofoldError(
             f"{len(faults)} of {len(times)} images of {clip} could not be understood (frames {spans(faults)}); at "

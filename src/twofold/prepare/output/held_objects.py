@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw
 from scipy import ndimage
 
-LEAST_SIGHTINGS = 5
+MIN_SIGHTINGS = 5
 """A vertex seen in fewer frames has no usual colour."""
 
 
@@ -126,7 +126,7 @@ def usual_colors(
     count = seen.sum(0)
     ordered = np.sort(np.where(seen[..., None], colors, 255).astype(np.uint8), axis=0)
     middle = np.maximum(count - 1, 0) // 2
-    return ordered[middle, np.arange(len(middle))] / 255, count >= LEAST_SIGHTINGS
+    return ordered[middle, np.arange(len(middle))] / 255, count >= MIN_SIGHTINGS
 
 
 def unlikeness(

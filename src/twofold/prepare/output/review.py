@@ -53,7 +53,7 @@ def compare_with_pictures(
     size: float,
     held_objects: Literal["keep", "remove"],
     alone: bool,
-    show: Callable[[float], None],
+    progress: Callable[[float], None],
 ) -> Agreement:
     """Goes through a camera's images with the body that was fitted; masks with objects in them are written anew.
 
@@ -66,7 +66,7 @@ def compare_with_pictures(
         size: of the person in the images, pixels.
         held_objects: "remove" takes balls and the like out of the masks and marks what they hide.
         alone: no other camera saw the person.
-        show: called with the fraction that is done.
+        progress: called with the fraction that is done.
     """
     posed = pose_motion(body, motion)
     shown = project(camera, place_points(posed, body_points(body), motion))[0].numpy()
@@ -117,12 +117,12 @@ def compare_with_pictures(
             sightings: list[Sighting | None] = []
             for sighting in pool.map(look, range(len(motion))):
                 sightings.append(sighting)
-                show(0.6 * len(sightings) / len(motion))
+                progress(0.6 * len(sightings) / len(motion))
             objects = moving_objects(sightings, watched.seconds)
         start = 0.0 if usual is None else 0.6
         for quality in pool.map(judge, range(len(motion))):
             qualities.append(quality)
-            show(start + (1 - start) * len(qualities) / len(motion))
+            progress(start + (1 - start) * len(qualities) / len(motion))
     return Agreement(tuple(qualities), ignored, removed)
 
 
