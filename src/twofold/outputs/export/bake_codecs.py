@@ -18,7 +18,7 @@ _NO_FRAME = -1
 
 
 @dataclass(frozen=True)
-class Paint:
+class BakedColors:
     """The colours of a baked shape.
 
     Attributes:
@@ -94,17 +94,17 @@ def atlas_codec(vertices: int) -> Codec[Atlas]:
     return Codec(lambda atlas: {"vertex": atlas.vertex, "faces": atlas.faces, "uv": atlas.uv}, decode)
 
 
-def paint_codec(vertices: int) -> Codec[Paint]:
+def paint_codec(vertices: int) -> Codec[BakedColors]:
     """Stores the colours of a mesh with this number of vertices."""
 
-    def decode(arrays: Arrays) -> Paint:
+    def decode(arrays: Arrays) -> BakedColors:
         require_arrays(arrays, {"colors": (vertices, 3), "observed": (vertices,)})
         images = [arrays.get(name) for name in _IMAGES]
         if any(image is not None and (image.ndim != 3 or image.shape[2] != 3) for image in images):
             raise ValueError("an image is none")
-        return Paint(arrays["colors"], arrays["observed"], images[0], images[1])
+        return BakedColors(arrays["colors"], arrays["observed"], images[0], images[1])
 
-    def encode(paint: Paint) -> Arrays:
+    def encode(paint: BakedColors) -> Arrays:
         images = {name: getattr(paint, name) for name in _IMAGES}
         known = {name: image for name, image in images.items() if image is not None}
         return {"colors": paint.colors, "observed": paint.observed} | known

@@ -24,7 +24,7 @@ from twofold.outputs.export.bake import (
     shown_surfaces,
 )
 from twofold.outputs.export.bake_cache import BakeCache, kept
-from twofold.outputs.export.bake_codecs import Paint, atlas_codec, paint_codec, shape_codec
+from twofold.outputs.export.bake_codecs import BakedColors, atlas_codec, paint_codec, shape_codec
 from twofold.outputs.export.character import Character, normals_of
 from twofold.outputs.export.lattice import TriangleLattice, build_lattice, segments_for
 from twofold.outputs.export.morphs import PulledBack, pull_back
@@ -154,7 +154,7 @@ def _paint(
     atlas: Atlas | None,
     color: str | Frame | int,
     progress: Progress,
-) -> Paint:
+) -> BakedColors:
     """Colours of a shape, and with an atlas its texture and normal map; `color` as in `bake`, or a frame."""
     averaged = shown_surfaces(avatar, shape, config)
     shown: Shown = averaged
@@ -170,14 +170,14 @@ def _paint(
     colors = bake_colors(avatar, shown, lattice.interpolate, branch, lit).cpu().numpy()
     observed = _observed(capture, shape.frames, averaged, faces)
     if atlas is None:
-        return Paint(colors[: len(vertices)], observed, None, None)
+        return BakedColors(colors[: len(vertices)], observed, None, None)
     progress(0.85, "texture")
     texture, _ = paint_texture(atlas, lattice, colors, config.texture)
     normals = None
     if not lit:
         wanted = bake_normals(avatar, spread(averaged, _NORMAL_FRAMES), lattice.interpolate, config.branch)
         normals = normal_map(vertices, faces, atlas, lattice, wanted.cpu().numpy(), config.texture)
-    return Paint(colors[: len(vertices)], observed, as_bytes_image(texture), normals)
+    return BakedColors(colors[: len(vertices)], observed, as_bytes_image(texture), normals)
 
 
 def _observed(
