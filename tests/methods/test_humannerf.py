@@ -42,8 +42,8 @@ def test_fast_recipe_changes_no_equation():
     """Numbers of samples, steps and rates differ, and which samples are left out; see docs/methods/humannerf.md."""
     first, second = (to_dict(recipe().method.skeletal) for recipe in (humannerf, humannerf_fast))
     assert {name for name in first if first[name] != second[name]} == {
-        "samples", "min_likelihood", "hidden_dtype", "volume_every", "motion_from", "motion_full", "guard_steps",
-        "guard_frames", "guard_size",
+        "samples", "min_likelihood", "min_weight", "hidden_dtype", "volume_every", "motion_from", "motion_full",
+        "guard_steps", "guard_frames", "guard_size",
     }  # fmt: skip
 
 

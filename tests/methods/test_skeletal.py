@@ -167,6 +167,27 @@ def test_unlikely_samples_may_be_left_out(subject, person):
     assert (images[2] - images[0]).abs().mean() < 5e-3
 
 
+def test_samples_that_cannot_be_seen_may_be_left_out_with_the_same_gradients(subject, person):
+    frame, rays = person.train[1], rays_of(person.train[1], 12)
+    images, gradients, shaded = [], [], []
+    for min_weight in (0.0, 1e-4, 2e-3):
+        # Denser than people are trained to be, so that there is much to hide.
+        avatar = built(RECIPE, subject, density=200.0, min_likelihood=1e-3, min_weight=min_weight)
+        queried = []
+        avatar.canonical.register_forward_hook(
+            lambda module, arguments, answer, queried=queried: queried.append(answer.density) and None
+        )
+        color = avatar.render(rays, avatar.pose(frame.pose, frame.translation, None, Mode(GONE)), BACKGROUND).color
+        color.square().mean().backward()
+        images.append(color.detach())
+        gradients.append(torch.cat([p.grad.flatten() for p in avatar.canonical.parameters()]))
+        shaded.append(sum(len(density) for density in queried if density.requires_grad))
+    assert shaded[0] > shaded[1] > shaded[2] > 0
+    for kept, image, gradient in ((1, 2e-4, 2e-4), (2, 1e-2, 1e-2)):
+        assert (images[kept] - images[0]).abs().max() < image
+        assert (gradients[kept] - gradients[0]).norm() < gradient * gradients[0].norm()
+
+
 def test_losses_are_means_over_patch_images_and_single_rays(avatar, person):
     pixels = replace(RECIPE.training.pixels, rays=5, patches=2, patch_size=16)
     batch = PixelSource(person.train, person.body, person.betas, pixels).draw(0, torch.Generator().manual_seed(0))

@@ -90,10 +90,17 @@ class ImageConditionedNerf(nn.Module):
             bone_offset: from `offset_to_nearest_bone`, metres.
             image_features: g, blended over the key frames (`field.resunet.ViewBlending`).
         """
-        encoded = [fourier_encoding(x, CANONICAL_OCTAVES, include_pi=False) for x in (x_canonical, bone_offset)]
-        latent = self.geometry(torch.cat(encoded, -1))
+        latent = self._latent(x_canonical, bone_offset)
         color = self.color(torch.cat([latent[:, :IMAGE_FEATURES], image_features], -1))
         return RadianceOutput(density=latent[:, IMAGE_FEATURES].relu(), color=color.sigmoid())
+
+    def density(self, x_canonical: Float[Tensor, "S 3"], bone_offset: Float[Tensor, "S 3"]) -> Float[Tensor, "S"]:
+        """The density alone; arguments as for `forward`."""
+        return self._latent(x_canonical, bone_offset)[:, IMAGE_FEATURES].relu()
+
+    def _latent(self, x_canonical: Tensor, bone_offset: Tensor) -> Tensor:
+        encoded = [fourier_encoding(x, CANONICAL_OCTAVES, include_pi=False) for x in (x_canonical, bone_offset)]
+        return self.geometry(torch.cat(encoded, -1))
 
 
 @torch.no_grad()

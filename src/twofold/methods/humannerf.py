@@ -58,6 +58,10 @@ class HumanNerfAvatar(SkeletalAvatar):
         x_canonical = self.motion(moved.points, posed.own.condition, posed.own.open_bands)
         return self.canonical(x_canonical), {}
 
+    def density(self, moved: SkeletalPoints, posed: Posed) -> Float[Tensor, "n"]:
+        """See `SkeletalAvatar.density`."""
+        return self.canonical(self.motion(moved.points, posed.own.condition, posed.own.open_bands)).density
+
 
 def humannerf() -> Recipe:
     """The authors' program for ZJU-MoCap. Days on a GPU, years on a CPU."""

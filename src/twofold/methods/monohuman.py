@@ -146,6 +146,11 @@ class MonoHumanAvatar(SkeletalAvatar):
         returned = self.to_posed(x_canonical[likely], own.from_canonical, posed)
         return answer, {"observed": observed[likely], "returned": returned, "likelihood": moved.likelihood[likely]}
 
+    def density(self, moved: SkeletalPoints, posed: Posed) -> Float[Tensor, "n"]:
+        """See `SkeletalAvatar.density`. It does not depend on the key frames' images."""
+        x_canonical = self.backward_motion(moved.points, posed.own.condition, posed.own.open_bands)
+        return self.field.density(x_canonical, offset_to_nearest_bone(x_canonical, self.rest_joints))
+
     def to_posed(
         self, x_canonical: Float[Tensor, "S 3"], from_canonical: Float[Tensor, "24 4 4"], posed: Posed
     ) -> Float[Tensor, "S 3"]:

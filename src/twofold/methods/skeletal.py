@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from twofold.body.skeleton import joint_transforms_of_rotations, pose_body, shape_body, skin
@@ -34,8 +34,10 @@ from twofold.methods.subject import Subject
 from twofold.metrics.perceptual import LPIPS
 from twofold.sampling.error_bounded import uniform_depths
 from twofold.sampling.joint_box import joint_box
+from twofold.sampling.visibility import seen_samples
 from twofold.volume.nerf_compositing import alpha_of_density, alpha_weights, open_samples
 from twofold.volume.rendering import composite
+from twofold.volume.samples import Samples
 
 RAYS_AT_ONCE = 2048
 """Rays that are shaded together where no gradient is wanted: 128 samples of each take half a gigabyte."""
@@ -88,6 +90,10 @@ class SkeletalAvatar(Avatar[SkeletalPose]):
             posed: the pose.
             mode: training or evaluation.
         """
+
+    @abstractmethod
+    def density(self, moved: SkeletalPoints, posed: Posed) -> Float[Tensor, "n"]:
+        """The density of `radiance` alone, in evaluation."""
 
     @property
     @abstractmethod
@@ -199,22 +205,42 @@ class SkeletalAvatar(Avatar[SkeletalPose]):
         """The samples along rays that meet the box."""
         samples = open_samples(uniform_depths(rays, self.settings.samples, generator))
         points = samples.points(rays)
-        moved = self._moved(points, posed)
+        if self.settings.min_weight > 0:
+            seen = self._seen(samples, points, posed, len(rays))
+            samples, points = samples[seen], points[seen]
+            moved = self._moved(points, posed, min_likelihood=None)
+        else:
+            moved = self._moved(points, posed, self.settings.min_likelihood)
         answer, extras = self.radiance(moved, points[moved.index], posed, mode)
         return Shaded(samples[moved.index], answer.density, answer.color, moved.likelihood, extras)
 
-    def _moved(self, points: Float[Tensor, "S 3"], posed: Posed) -> SkeletalPoints:
-        """Points of aligned space in the T-pose; likely ones only, where the settings say so."""
+    @torch.no_grad()
+    def _seen(self, samples: Samples, points: Float[Tensor, "S 3"], posed: Posed, rays: int) -> Int[Tensor, "n"]:
+        """Which samples add more than `min_weight` to their pixel."""
+        moved = self._moved(points, posed, self.settings.min_likelihood)
+        likely = samples[moved.index]
+
+        def density(index: Tensor) -> Tensor:
+            delta, likelihood = likely.delta[index], moved.likelihood[index]
+            part = SkeletalPoints(moved.index[index], moved.points[index], likelihood)
+            alpha = alpha_of_density(self.density(part, posed), delta) * likelihood
+            # The density without a likelihood that is as opaque.
+            return -torch.log1p(-alpha.clamp_max(1 - 1e-6)) / delta
+
+        return moved.index[seen_samples(likely, density, rays, self.settings.min_weight)]
+
+    def _moved(self, points: Float[Tensor, "S 3"], posed: Posed, min_likelihood: float | None) -> SkeletalPoints:
+        """Points of aligned space in the T-pose; only those that are more likely than that, if it is given."""
         own, box = posed.own, canonical_box(self.rest_joints)
-        return skeletal_backward(own.weights, points, own.to_canonical, box, self.settings.min_likelihood)
+        return skeletal_backward(own.weights, points, own.to_canonical, box, min_likelihood)
 
     def level(self, x: Float[Tensor, "S 3"], posed: Posed, branch: str = "full") -> Float[Tensor, "S"]:
         """See `Avatar.level`: 3 cm times (1 - d / d0), at least -3 cm, with d the density times the likelihood."""
         require(branch in ("full", "base"), f'branch is "full" or "base"; it is {branch!r}')
         points = skin(x, x.new_ones(len(x), 1), posed.own.to_aligned[None])
-        moved = self._moved(points, posed)
-        answer, _ = self.radiance(moved, points[moved.index], posed, EVALUATION)
-        density = torch.zeros(len(x), device=x.device).index_add(0, moved.index, answer.density * moved.likelihood)
+        moved = self._moved(points, posed, self.settings.min_likelihood)
+        likely = self.density(moved, posed) * moved.likelihood
+        density = torch.zeros(len(x), device=x.device).index_add(0, moved.index, likely)
         return LEVEL_SCALE * (1 - density / self.settings.level_density).clamp_min(-1)
 
     @property

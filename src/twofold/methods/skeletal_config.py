@@ -20,6 +20,8 @@ class SkeletalConfig:
     """Samples along a ray, from where it enters the box of the joints to where it leaves it."""
     min_likelihood: float | None = None
     """Samples that less likely belong to the person are not shaded; none shades all."""
+    min_weight: float = 0.0
+    """Samples that a pass without gradients finds to add less than this to their pixel are not shaded; 0 shades all."""
     hidden_dtype: Literal["float32", "bfloat16", "auto"] = "float32"
     """Type of the hidden layers of the networks at samples; "auto": bfloat16 where the processor multiplies it fast."""
     volume_channels: tuple[int, ...] = (1024, 512, 512, 256, 256)
@@ -54,8 +56,8 @@ class SkeletalConfig:
     def __post_init__(self) -> None:
         """Refuses settings that nothing can be made of."""
         require_within(
-            self, samples=(2, 4096), min_likelihood=(0, 1), volume_channels=(1, 8192), volume_code=(1, 8192),
-            volume_every=(1, MAX_STEPS), correct_from=(0, MAX_STEPS), motion_from=(0, MAX_STEPS),
+            self, samples=(2, 4096), min_likelihood=(0, 1), min_weight=(0, 0.1), volume_channels=(1, 8192),
+            volume_code=(1, 8192), volume_every=(1, MAX_STEPS), correct_from=(0, MAX_STEPS), motion_from=(0, MAX_STEPS),
             motion_full=(1, MAX_STEPS), squared_error=(0, 1e6), lpips=(0, 1e6), guard_steps=(1, MAX_STEPS),
             guard_frames=(1, 10_000), guard_size=(8, 100_000), level_density=(1e-3, 1e6),
         )  # fmt: skip
@@ -131,6 +133,7 @@ def affordable(config: SkeletalConfig) -> SkeletalConfig:
         config,
         samples=64,
         min_likelihood=0.02,
+        min_weight=1e-3,
         hidden_dtype="auto",
         volume_every=8,
         motion_from=300,
