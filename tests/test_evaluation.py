@@ -16,7 +16,8 @@ from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
 from twofold.metrics.protocols import Networks
 from twofold.outputs.views import RenderedImage
-from twofold.training.run import load
+from twofold.training.clock import read_spent
+from twofold.training.run import CHECKPOINT, load
 
 
 @pytest.fixture
@@ -53,6 +54,7 @@ def test_what_is_ignored_spoils_no_figure_and_its_share_is_told(capture, monkeyp
 
 def refined_avatar(parts):
     avatar = Mock(spec=Avatar)
+    avatar.parameters.return_value = []
     avatar.pose_corrections.return_value = PoseRefinement(torch.tensor([0]), 2, parts).change() if parts else {}
     return avatar
 
@@ -77,14 +79,14 @@ def test_what_refined_poses_change_is_told_before_and_after(capture, monkeypatch
     assert "poses of the capture" in told["held_out_psnr_box_before"]
 
 
-def test_without_refinement_there_is_no_before_and_after(capture, monkeypatch, tmp_path):
+def test_without_refinement_there_is_no_before_and_after(capture, monkeypatch):
     def drawn(avatar, capture, frame, refined):
         image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
         return RenderedImage(image, mask, depth=mask, normal=image, base=image, base_normal=image)
 
     monkeypatch.setattr(evaluate, "render_frame", drawn)
-    assert "pose_refinement" not in evaluate.evaluate(refined_avatar(()), capture, tmp_path)
-    assert "pose_refinement" in evaluate.evaluate(refined_avatar(("root",)), capture, tmp_path)
+    assert "pose_refinement" not in evaluate.measure(refined_avatar(()), capture)
+    assert "pose_refinement" in evaluate.measure(refined_avatar(("root",)), capture)
 
 
 def test_progress_goes_to_the_end_and_no_further(trained, tmp_path):
@@ -95,11 +97,11 @@ def test_progress_goes_to_the_end_and_no_further(trained, tmp_path):
     assert shares == sorted(shares)
     assert shares[-1] == pytest.approx(1)
     assert all(before < 1 for before in shares[:-1])
-    sections = {name for name in metrics if name != "pose_refinement"}
+    sections = {name for name in metrics if name not in ("pose_refinement", "cost")}
     assert {what for _, what in told} == sections | {"pose refinement"}
 
 
-def test_by_default_a_long_split_is_sampled_evenly_and_the_protocol_says_so(capture, monkeypatch, tmp_path):
+def test_by_default_a_long_split_is_sampled_evenly_and_the_protocol_says_so(capture, monkeypatch):
     seen = []
 
     def drawn(avatar, capture, frame, refined):
@@ -112,15 +114,29 @@ def test_by_default_a_long_split_is_sampled_evenly_and_the_protocol_says_so(capt
     long = replace(
         capture, splits={**capture.splits, "novel_pose": tuple(replace(frame, frame_index=t) for t in range(300))}
     )
-    metrics = evaluate.evaluate(refined_avatar(()), long, tmp_path)
+    metrics = evaluate.measure(refined_avatar(()), long)
     held_out = seen[:-1]
     assert (len(held_out), held_out[0], held_out[-1]) == (30, 0, 299)
     assert set(np.diff(held_out)) <= {10, 11}
     assert metrics["novel_pose"]["protocol"]["frames"].startswith("mean over 30 of 300 images, evenly spread, of the")
     assert metrics["train"]["protocol"]["frames"].startswith("mean over all 1 images of the split train")
     seen.clear()
-    evaluate.evaluate(refined_avatar(()), long, tmp_path, most=None)
+    evaluate.measure(refined_avatar(()), long, most=None)
     assert len(seen) == 301
+
+
+def test_what_an_avatar_costs_is_told_with_its_metrics(trained, tmp_path):
+    avatar, _ = load(trained.folder)
+    spent = read_spent(trained.folder / CHECKPOINT)
+    cost = evaluate.measure_cost(avatar, trained.capture, spent)
+    assert cost["parameters"] == sum(p.numel() for p in avatar.parameters())
+    assert cost["training_seconds"] == spent.seconds > 0
+    assert cost["frame_seconds"] > 0
+    assert cost["protocol"].keys() == cost.keys() - {"protocol"}
+    camera = trained.capture.splits["novel_view"][0].camera
+    assert f"one image of {camera.width} x {camera.height} (novel_view)" in cost["protocol"]["frame_seconds"]
+    # A run of an older version does not know how long its training took.
+    assert "training_seconds" not in evaluate.measure_cost(avatar, trained.capture, None)
 
 
 def exact(avatar, capture, frame, refined):

@@ -19,6 +19,8 @@ from twofold.metrics.protocols import Networks, ProtocolMeans
 from twofold.outputs.mesh import posed_surface
 from twofold.outputs.shares import Shares
 from twofold.outputs.views import RenderedImage, render_image
+from twofold.training.clock import Clock, Spent, read_spent
+from twofold.training.run import CHECKPOINT
 
 NEAR = 0.5
 """Seconds over which the errors of an estimator's poses last."""
@@ -216,6 +218,37 @@ def measure_consistency(
     return figures | {"protocol": {**video_metrics.PROTOCOLS, "frames": told}}
 
 
+def measure_cost(avatar: Avatar, capture: Capture, spent: Spent | None) -> dict[str, object]:
+    """Parameters, time of the training (where it is known), and the time that an image takes.
+
+    Args:
+        avatar: to measure.
+        capture: an image of its first split that has some is rendered once more; all is warm by then.
+        spent: by the training.
+    """
+    split = next(name for name in ("novel_view", "novel_pose", "train") if capture.splits.get(name))
+    frame = capture.splits[split][0]
+    clock = Clock(None)
+    render_frame(avatar, capture, frame, False)
+    image, threads = clock.spent(), torch.get_num_threads()
+    where = f"{avatar.device}, {threads} thread{'s' if threads > 1 else ''}"
+    found: dict[str, object] = {"parameters": sum(p.numel() for p in avatar.parameters())}
+    protocol = {
+        "parameters": "numbers that are stored for the avatar, codes and corrections of training frames included"
+    }
+    if spent is not None:
+        found |= {"training_seconds": spent.seconds, "training_processor_seconds": spent.processor}
+        protocol |= {
+            "training_seconds": "on the clock, all sessions together, preparation and previews included",
+            "training_processor_seconds": "the same on all cores together, of the leading process",
+        }
+    found |= {"frame_seconds": image.seconds, "frame_processor_seconds": image.processor}
+    size = f"{frame.camera.width} x {frame.camera.height}"
+    protocol["frame_seconds"] = f"on the clock, to pose and render one image of {size} ({split}), {where}"
+    protocol["frame_processor_seconds"] = "the same on all cores together"
+    return found | {"protocol": protocol}
+
+
 def evaluate(
     avatar: Avatar, capture: Capture, folder: Path, most: int | None = MAX_IMAGES, meshes: int | None = 4,
     progress: Callable[[float, str], None] | None = None, extra: dict[str, object] | None = None,
@@ -236,7 +269,8 @@ def evaluate(
     Raises:
         TwofoldError: an image or mesh is damaged, or the avatar's numbers are not finite.
     """
-    metrics = measure(avatar, capture, most, meshes, progress, networks) | (extra or {})
+    metrics = measure(avatar, capture, most, meshes, progress, networks)
+    metrics |= {"cost": measure_cost(avatar, capture, read_spent(folder / CHECKPOINT))} | (extra or {})
     write_json(folder / "metrics.json", metrics)
     return metrics
 

@@ -233,7 +233,10 @@ def test_training_lowers_the_loss(trained: Run) -> None:
 def test_a_surface_that_is_not_finite_ends_a_training(person: Capture, tmp_path: Path, monkeypatch) -> None:
     """Finite parameters may overflow where they are combined."""
     monkeypatch.setattr("twofold.training.loop._level_on_body", lambda avatar, frame: torch.tensor([0.1, torch.nan]))
-    with pytest.raises(TwofoldError, match="diverged: the surface is not finite at step 2; lower the learning rates"):
+    with pytest.raises(
+        TwofoldError,
+        match="diverged: the surface is not finite at step 2; lower the learning rates .now method.rates.low=",
+    ):
         train(person, recipe_of(2), tmp_path / "run", CPU)
     assert not (tmp_path / "run" / "checkpoint.safetensors").exists()
 

@@ -227,8 +227,10 @@ def evaluate(
         if section.endswith("_protocols"):
             print_protocols(section, values)
         elif isinstance(values, dict):
-            numbers = {k: v for k, v in values.items() if isinstance(v, float)}
-            line = f"{section}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items())
+            numbers = {k: v for k, v in values.items() if isinstance(v, int | float)}
+            line = f"{section}: " + ", ".join(
+                f"{k} {v:,}" if isinstance(v, int) else f"{k} {v:.4g}" for k, v in numbers.items()
+            )
             console().print(line, soft_wrap=True)
     sampled = {split: len(read.splits.get(split, ())) for split in ("novel_view", "novel_pose")}
     if images is not None and max(sampled.values()) > images:

@@ -3,13 +3,9 @@
 import contextlib
 import itertools
 import math
-import signal
-import threading
-import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 import torch
@@ -25,15 +21,16 @@ from twofold.methods.base import Avatar, Mode, Stage
 from twofold.methods.subject import Subject
 from twofold.recipe import Recipe, TrainingConfig
 from twofold.sampling.joint_box import RELEASED_MARGIN, RELEASED_SLACK
+from twofold.training.clock import Clock
 from twofold.training.curves import Curves
 from twofold.training.lock import locked
 from twofold.training.pixels import PixelSource
 from twofold.training.processes import Team, joined
 from twofold.training.run import (
     CHECKPOINT,
-    LOWER_RATES,
     load_optimizer,
     load_state,
+    lower_rates,
     read_checkpoint,
     read_subject,
     require_finite,
@@ -42,6 +39,7 @@ from twofold.training.run import (
     start_folder,
     write_checkpoint,
 )
+from twofold.training.stopping import asked_to_stop
 
 MAX_RESTARTS = 5
 """Times that a training may begin again by itself."""
@@ -206,6 +204,7 @@ def train(
             start_folder(folder, recipe, subject, capture.folder, tuple(notes))
             if not begun:
                 at_the_end.enter_context(locked(folder))
+        clock = Clock(folder / CHECKPOINT if resume else None)
         run = _Run(capture, recipe, folder, device, team, avatar)
         run.restore(resume)
         curves = Curves(folder, run.step) if team.leads else None
@@ -214,7 +213,7 @@ def train(
         while run.step < run.steps:
             terms, error = run.advance()
             done, steps = run.step, run.steps
-            report, stop = _agreed(team, terms, error, stopped(), done, steps)
+            report, stop = _agreed(team, recipe, terms, error, stopped(), done, steps)
             if avatar.after_step(run.mode, capture) == "restart":
                 run.restart()
                 if curves is not None:
@@ -233,7 +232,7 @@ def train(
                 if done % config.checkpoint_every == 0 or done == steps or stop:
                     # In this order: the curves are cut back to the checkpoint, not the other way round.
                     curves.save()
-                    write_checkpoint(folder, avatar, run.optimizer, done, run.restarts)
+                    write_checkpoint(folder, avatar, run.optimizer, done, run.restarts, clock.spent())
                 if preview and config.preview_every and done % config.preview_every == 0 and done < steps:
                     avatar.eval()
                     preview(avatar, done)
@@ -357,7 +356,7 @@ class _Run:
 
 
 def _agreed(
-    team: Team, terms: dict[str, Tensor], error: Tensor, stop: bool, done: int, steps: int
+    team: Team, recipe: Recipe, terms: dict[str, Tensor], error: Tensor, stop: bool, done: int, steps: int
 ) -> tuple[Progress, bool]:
     """What all processes found, averaged, and whether one of them was asked to stop, so that all stop together.
 
@@ -369,32 +368,7 @@ def _agreed(
     named = dict(zip(terms, found, strict=True))
     if not math.isfinite(sum(found)):
         raise TwofoldError(
-            f"The loss at step {done - 1} is not a finite number; {LOWER_RATES}, or look at the capture's images and "
-            "poses."
+            f"The loss at step {done - 1} is not a finite number; {lower_rates(recipe)}, or look at the capture's "
+            "images and poses."
         )
     return Progress(done, steps, named, -10 * math.log10(max(error_mean, 1e-10))), stopping > 0
-
-
-@contextlib.contextmanager
-def asked_to_stop() -> Generator[Callable[[], bool], None, None]:
-    """Ctrl-C as a question that the loop asks between steps, so that no step is ever half applied.
-
-    A second Ctrl-C interrupts at once, as usual, but only a second later: `torchrun` passes on what the terminal has
-    sent already. Outside the main thread, signals are somebody else's.
-    """
-    asked = math.inf
-
-    def note(number: int, stack: FrameType | None) -> None:
-        nonlocal asked
-        if time.monotonic() - asked >= 1:
-            signal.default_int_handler(number, stack)
-        asked = min(asked, time.monotonic())
-
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield lambda: asked < math.inf
-    finally:
-        signal.signal(signal.SIGINT, before)

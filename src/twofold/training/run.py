@@ -17,6 +17,7 @@ from torch import Tensor
 
 from twofold import __version__
 from twofold.capture.types import Capture
+from twofold.config import to_dict
 from twofold.errors import TwofoldError
 from twofold.files import new_folder, plain_errors, write_atomically, write_json, write_npz
 from twofold.inputs import is_there, read_json, require_file, shown, shown_path
@@ -25,14 +26,24 @@ from twofold.methods.subject import Subject
 from twofold.methods.table import recipe_from_dict, recipe_to_dict
 from twofold.npz import read_npz
 from twofold.recipe import Recipe
+from twofold.training.clock import Spent
 
 RECIPE, ABOUT, SUBJECT, CHECKPOINT, CURVES = (
     "recipe.json", "run.json", "subject.npz", "checkpoint.safetensors", "curves.csv",
 )  # fmt: skip
 """What a run folder holds. The recipe is written last, so a folder that has one has all it takes to begin."""
-LOWER_RATES = "lower the learning rates (--set method.rates.low=... and the others) and train again"
-"""What helps a training whose numbers run away."""
 _DAMAGED = "is damaged; train again"
+
+
+def lower_rates(recipe: Recipe) -> str:
+    """What helps a training whose numbers run away: the settings of the method's own learning rates, as they are.
+
+    >>> from twofold.methods.table import RECIPES
+    >>> lower_rates(RECIPES["danbo"]())
+    'lower the learning rates (now method.rates.all=0.0005; --set changes them) and train again'
+    """
+    rates = ", ".join(f"method.rates.{name}={rate:g}" for name, rate in to_dict(recipe.method.rates).items())
+    return f"lower the learning rates (now {rates}; --set changes them) and train again"
 
 
 def choose_device(name: str) -> torch.device:
@@ -198,7 +209,7 @@ def load(folder: Path, device: torch.device | str = "cpu") -> tuple[Avatar, int]
     if broken:
         raise TwofoldError(
             f"{folder / CHECKPOINT} holds {broken} with numbers that are not finite, so its avatar cannot be used; "
-            f"{LOWER_RATES}."
+            f"{lower_rates(recipe)}."
         )
     return avatar.to(device).eval(), step
 
@@ -225,9 +236,18 @@ def _kind(tensor: Tensor) -> tuple[torch.Size, bool]:
 
 
 def write_checkpoint(
-    folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer, step: int, restarts: int = 0
-) -> None:
+    folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer, step: int, restarts: int = 0,
+    spent: Spent | None = None,
+) -> None:  # fmt: skip
     """Stores everything that continuing needs, beside the old checkpoint and then in its place.
+
+    Args:
+        folder: the run.
+        avatar: as it is.
+        optimizer: with its moments.
+        step: how many were made.
+        restarts: how often the training has begun again.
+        spent: the time that all of it took.
 
     Raises:
         TwofoldError: a parameter is not finite, so the old checkpoint stays; or the disk refuses.
@@ -239,7 +259,7 @@ def write_checkpoint(
     whole = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     with write_atomically(folder / CHECKPOINT) as beside:
         about = {"step": str(step), "restarts": str(restarts), "tensors": str(len(whole)), "twofold": __version__}
-        beside.write_bytes(save(whole, metadata=about))
+        beside.write_bytes(save(whole, metadata=about | (spent.as_text() if spent else {})))
 
 
 def require_finite(tensors: Mapping[str, Tensor], folder: Path, step: int) -> None:
@@ -250,8 +270,8 @@ def require_finite(tensors: Mapping[str, Tensor], folder: Path, step: int) -> No
     """
     broken = not_finite(tensors)
     if broken:
-        name = broken.removeprefix("avatar.")
-        raise TwofoldError(f"The training of {folder} diverged: {name} is not finite at step {step}; {LOWER_RATES}.")
+        name, advice = broken.removeprefix("avatar."), lower_rates(read_recipe(folder))
+        raise TwofoldError(f"The training of {folder} diverged: {name} is not finite at step {step}; {advice}.")
 
 
 def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], int, int]:
