@@ -235,7 +235,7 @@ def test_a_surface_that_is_not_finite_ends_a_training(person: Capture, tmp_path:
     monkeypatch.setattr("twofold.training.loop._level_on_body", lambda avatar, frame: torch.tensor([0.1, torch.nan]))
     with pytest.raises(
         TwofoldError,
-        match="diverged: the surface is not finite at step 2; lower the learning rates .now method.rates.low=",
+        match=r"diverged: the surface is not finite at step 2; lower the learning rates .now method.rates.low=",
     ):
         train(person, recipe_of(2), tmp_path / "run", CPU)
     assert not (tmp_path / "run" / "checkpoint.safetensors").exists()

@@ -244,7 +244,7 @@ def write_checkpoint(
     Args:
         folder: the run.
         avatar: as it is.
-        optimizer: with its moments.
+        optimizer: with its state.
         step: how many were made.
         restarts: how often the training has begun again.
         spent: the time that all of it took.
