@@ -3,6 +3,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= demo
+CLIENT := src/twofold/html/client
 PYTEST_ARGS ?=
 SOURCES := src tests docs/hooks $(wildcard benchmarks)
 
@@ -11,7 +12,7 @@ export NO_MKDOCS_2_WARNING := true
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all checks pytest docs format benchmarks gpu-bundle web-tools clean
+.PHONY: help demo test test-all checks pytest docs format benchmarks gpu-bundle web-tools vendor clean
 
 help: ## This list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -50,6 +51,10 @@ gpu-bundle: $(VENV)/.ready-studio ## What a machine with a GPU and no network ne
 
 web-tools: ## What the tests in Node and Chromium need (Node and Chromium themselves come from your system)
 	npm ci --no-audit --no-fund --prefix tests/web
+
+vendor: ## Bundle the report's script (three.js and html/client) anew from npm into src/twofold/html/vendor
+	npm ci --no-audit --no-fund --ignore-scripts --prefix $(CLIENT)
+	cd $(CLIENT) && node build.mjs
 
 clean: ## Remove what the targets made, .venv included
 	rm -rf $(VENV) site dist build .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -90,6 +90,11 @@ def with_overrides(config: T, overrides: Sequence[str]) -> T:
     return config
 
 
+def list_settings(config: object) -> list[tuple[str, str, str]]:
+    """Every setting as its key, its value as `--set` takes it, and its documentation where there is some."""
+    return [(key, _shown(value), text or "") for key, value, text in _leaves(config)]
+
+
 def describe(config: object) -> list[str]:
     """One line `key = value` for every setting, with its documentation where there is some."""
     rows = [(f"{key} = {_shown(value)}", text) for key, value, text in _leaves(config)]

@@ -22,6 +22,8 @@ from twofold.outputs.views import RenderedImage, render_image
 from twofold.training.clock import Clock, Spent, read_spent
 from twofold.training.run import CHECKPOINT
 
+Rendered = Callable[[str, Frame, RenderedImage], None]
+"""Takes the rendering of a split's frame."""
 NEAR = 0.5
 """Seconds over which the errors of an estimator's poses last."""
 _MESH = 4.0
@@ -252,7 +254,7 @@ def measure_cost(avatar: Avatar, capture: Capture, spent: Spent | None) -> dict[
 def evaluate(
     avatar: Avatar, capture: Capture, folder: Path, most: int | None = MAX_IMAGES, meshes: int | None = 4,
     progress: Callable[[float, str], None] | None = None, extra: dict[str, object] | None = None,
-    networks: Networks | None = None,
+    networks: Networks | None = None, rendered: Rendered | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """`measure` with its metrics written to `metrics.json` in the run's folder.
 
@@ -265,11 +267,12 @@ def evaluate(
         progress: called with the fraction that is done and what is being measured.
         extra: further sections for the file.
         networks: see `measure`.
+        rendered: see `measure`.
 
     Raises:
         TwofoldError: an image or mesh is damaged, or the avatar's numbers are not finite.
     """
-    metrics = measure(avatar, capture, most, meshes, progress, networks)
+    metrics = measure(avatar, capture, most, meshes, progress, networks, rendered)
     metrics |= {"cost": measure_cost(avatar, capture, read_spent(folder / CHECKPOINT))} | (extra or {})
     write_json(folder / "metrics.json", metrics)
     return metrics
@@ -278,6 +281,7 @@ def evaluate(
 def measure(
     avatar: Avatar, capture: Capture, most: int | None = MAX_IMAGES, meshes: int | None = 4,
     progress: Callable[[float, str], None] | None = None, networks: Networks | None = None,
+    rendered: Rendered | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """Metrics of everything that the capture knows the ground truth of.
 
@@ -289,6 +293,7 @@ def measure(
         progress: called with the fraction that is done and what is being measured.
         networks: measures under the settings of several papers as well (`twofold.metrics.protocols`), and the
             consistency of a video, with what networks there are; None leaves both out.
+        rendered: called with the split, frame and rendering of every held-out image.
 
     Raises:
         TwofoldError: an image or mesh is damaged, or the avatar's numbers are not finite.
@@ -317,6 +322,8 @@ def measure(
         def seen(frame: Frame, image: RenderedImage, split: str = split, means: ProtocolMeans | None = means) -> None:
             if means:
                 add_picture(means, capture, frame, image)
+            if rendered:
+                rendered(split, frame, image)
             count(split)
 
         part = measure_split(avatar, capture, split, most, True, seen)

@@ -74,7 +74,7 @@ def export(
     request = ExportRequest(
         tuple(dict.fromkeys(format)),
         BakeConfig(faces, branch, morphs, texture=0 if vertex_colors else texture, lit=lit),
-        _color(color), frame, "capture" in motion, (), ExportOptions(rig, name, author, image),
+        _color(color), frame, "capture" in motion, options=ExportOptions(rig, name, author, image),
     )  # fmt: skip
     avatar, _ = load(run, where)
     request = replace(request, motions=_motions(avatar, [word for word in motion if word not in _OWN], read))

@@ -21,6 +21,7 @@ from twofold.cli.console import ALONE, bar, console, say, within
 from twofold.cli.exports import export
 from twofold.cli.motions import NO_MOTION, MotionView, motion, render_motion
 from twofold.cli.protocol_table import networks_asked_for, print_protocols
+from twofold.cli.reports import report
 from twofold.cli.streams import streams_that_never_fail
 from twofold.errors import TwofoldError
 
@@ -271,6 +272,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "evaluate": evaluate,
     "motion": motion,
     "export": export,
+    "report": report,
 }
 
 

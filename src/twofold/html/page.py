@@ -1,7 +1,7 @@
 """HTML pages from the templates of this package: Jinja2 with every text escaped, style and images inside the page.
 
-A page needs nothing else and asks no host for anything; it has no script, is readable on a phone, and follows the
-reader's choice of light or dark.
+A page needs nothing else and asks no host for anything; it has no script but that of the interactive character
+(`twofold.html.character`), is readable on a phone, and follows the reader's choice of light or dark.
 """
 
 import base64
@@ -52,6 +52,21 @@ class Table:
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    folded: str = ""
+    """Where given, the table is shown when these words are clicked."""
+
+
+@dataclass(frozen=True)
+class EmbeddedVideo:
+    """A video as the page holds it.
+
+    Attributes:
+        source: a data address with the whole content.
+        caption: below it; empty for none.
+    """
+
+    source: str
+    caption: str = ""
 
 
 @dataclass(frozen=True)
@@ -99,12 +114,12 @@ def paragraphs(text: str) -> Markup:
 
 
 def embedded_image(
-    image: Path | UInt8[ndarray, "h w 3"], caption: str = "", kind: Literal["png", "jpeg"] = "png"
+    image: Path | UInt8[ndarray, "h w c"], caption: str = "", kind: Literal["png", "jpeg"] = "png"
 ) -> EmbeddedImage:
     """An image with its content inside.
 
     Args:
-        image: a file (PNG, JPEG, WebP), taken as it is, or pixels.
+        image: a file (PNG, JPEG, WebP), taken as it is, or pixels (of three channels, or as PNG with opacity of four).
         caption: to show below it.
         kind: how pixels are stored.
 
@@ -121,9 +136,23 @@ def embedded_image(
         width, height = header.width, header.height
     else:
         buffer = io.BytesIO()
-        Image.fromarray(image).save(buffer, kind.upper(), optimize=True)
+        options = {"quality": 92, "subsampling": 0} if kind == "jpeg" else {"optimize": True}
+        Image.fromarray(image).save(buffer, kind.upper(), **options)
         content, stored, (height, width) = buffer.getvalue(), kind, image.shape[:2]
     return EmbeddedImage(f"data:image/{stored};base64,{base64.b64encode(content).decode()}", width, height, caption)
+
+
+def embedded_video(path: Path, caption: str = "") -> EmbeddedVideo:
+    """A video (MP4) with its content inside.
+
+    Raises:
+        TwofoldError: the file is missing or of another kind.
+    """
+    if path.suffix.lower() != ".mp4":
+        raise TwofoldError(f"The report's video {path} is no .mp4.")
+    if not path.is_file():
+        raise TwofoldError(f"The report's video {path} is missing; render it first.")
+    return EmbeddedVideo(f"data:video/mp4;base64,{base64.b64encode(path.read_bytes()).decode()}", caption)
 
 
 @functools.cache

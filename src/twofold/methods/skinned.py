@@ -199,17 +199,19 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         # Canonical space is in metres, in the release too.
         return normal_matrices(nearest, weights_by(self.config.falloff, away.square()), own.surface.forward)
 
-    def _shell(self, body: PosedBody, frame_index: int | None, mode: Mode) -> Shell:
+    def _shell(self, body: PosedBody, frame_index: int | None, mode: Mode) -> Callable[[], Shell]:
         sampler, neighbours = self.config.sampler, max(self.config.neighbours, self.config.late_neighbours or 1)
         row = self.refinement.rows.get(frame_index) if mode.training and frame_index is not None else None
         if row is None:
-            return sampler.shell(body.vertices, body.faces, neighbours)
+            # Surfaces are taken from a pose without looking into its shell, which takes longer than all the rest.
+            return lambda: sampler.shell(body.vertices, body.faces, neighbours)
         if row not in self._shells:
             with torch.no_grad():
                 shaped = self._shape(self.shell_shape)
                 start = pose_body(shaped, self.shell_poses[row], self.shell_translations[row])
             self._shells[row] = sampler.shell(start.vertices, body.faces, neighbours)
-        return self._shells[row]
+        shell = self._shells[row]
+        return lambda: shell
 
     def render(
         self, rays: Rays, posed: Posed, background: Float[Tensor, "*r 3"] | None, mode: Mode = EVALUATION,

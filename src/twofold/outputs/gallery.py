@@ -52,15 +52,14 @@ def _background(capture: Capture) -> Tensor:
 
 
 def panels(image: RenderedImage) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
-    """What a rendering is made of, as images: full, base, residual, normals of both, opacity."""
-    parts = {
-        "full": image.color,
-        "base": image.base,
-        "residual": residual_image(image.color, image.base),
-        "normals": color_normals(image.normal, image.opacity),
-        "base normals": color_normals(image.base_normal, image.opacity),
-        "opacity": image.opacity,
-    }
+    """What a rendering is made of, as images: full, normals, opacity; of a base branch base, residual, normals."""
+    parts = {"full": image.color}
+    if image.has_base:
+        parts |= {"base": image.base, "residual": residual_image(image.color, image.base)}
+    parts["normals"] = color_normals(image.normal, image.opacity)
+    if image.has_base:
+        parts["base normals"] = color_normals(image.base_normal, image.opacity)
+    parts["opacity"] = image.opacity
     return {name: as_bytes(part) for name, part in parts.items()}
 
 
@@ -87,22 +86,31 @@ def comparison(
     drawn: Callable[[], None] | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:  # fmt: skip
     """A sheet with a row for each frame: the truth beside all panels, cut to the person."""
+
+    def rendered() -> Iterator[tuple[Frame, RenderedImage]]:
+        for frame in frames:
+            yield frame, beside_truth(avatar, capture, frame, chunk)[1]
+            if drawn:
+                drawn()
+
+    return comparison_sheet(capture, rendered())
+
+
+def comparison_sheet(capture: Capture, rendered: Iterable[tuple[Frame, RenderedImage]]) -> UInt8[np.ndarray, "h w 3"]:
+    """The same of frames that were rendered already."""
     rows: list[list[UInt8[np.ndarray, "h w 3"]]] = []
     labels: list[str] = []
     columns: list[str] = []
-    for frame in frames:
-        true, image = beside_truth(avatar, capture, frame, chunk)
-        parts = {"truth": true, **panels(image)}
+    for frame, image in rendered:
+        parts = {"truth": as_bytes(shown_truth(frame, _background(capture))), **panels(image)}
         columns = list(parts)
-        where = _around(frame.mask())
+        where = around_person(frame.mask())
         rows.append([part[where] for part in parts.values()])
         labels.append(f"{frame.camera_name} {frame.frame_index}")
-        if drawn:
-            drawn()
     return sheet(rows, labels, columns)
 
 
-def _around(mask: Float[Tensor, "h w"]) -> tuple[slice, slice]:
+def around_person(mask: Float[Tensor, "h w"]) -> tuple[slice, slice]:
     """The person's box and a little room; the whole image where nobody is."""
     return subject_box(mask, margin=6) if (mask > 0.5).any() else (slice(None), slice(None))
 
@@ -125,7 +133,7 @@ def scene_up(capture: Capture) -> Float[Tensor, "3"]:
 def motion_frames(
     avatar: Avatar, capture: Capture, split: str, size: int, chunk: int | None = None
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """A split's poses one after the other from one fixed camera, full beside base."""
+    """A split's poses one after the other from one fixed camera; full beside base, where there is a base branch."""
     frames_by_index = {frame.frame_index: frame for frame in reversed(capture.splits[split])}
     camera = None
     for time in sorted(frames_by_index):
@@ -134,7 +142,8 @@ def motion_frames(
         camera = camera or frame.camera.resized(height, round(frame.camera.width * height / frame.camera.height))
         posed = avatar.pose(frame.pose, frame.translation)
         image = render_image(avatar, posed, camera, _background(capture), chunk)
-        yield np.concatenate([as_bytes(image.color), as_bytes(image.base)], 1)
+        parts = [image.color, image.base] if image.has_base else [image.color]
+        yield np.concatenate([as_bytes(part) for part in parts], 1)
 
 
 def render_run(

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import TypeAlias
 
+import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -81,6 +82,16 @@ def sheet(
     for j, line in enumerate(notes):
         draw.text((margin, bottom + 0.75 * size + 1.2 * size * j), line, FAINT, small, anchor="lt")
     return np.asarray(page).copy()
+
+
+ERROR_RANGE = 0.25
+"""The mean absolute difference of colours that an error map shows brightest."""
+
+
+def error_map(color: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Mean absolute difference of the channels, from black (0) over red to pale yellow (`ERROR_RANGE` and more)."""
+    error = ((color - truth).abs().mean(-1) / ERROR_RANGE).clamp(0, 1)
+    return torch.from_numpy(matplotlib.colormaps["inferno"](error.cpu().numpy())[..., :3]).float()
 
 
 def color_normals(

@@ -30,6 +30,11 @@ class RenderedImage:
     base_opacity: Float[Tensor, "h w"] | None = None
 
     @property
+    def has_base(self) -> bool:
+        """Whether a base branch was rendered, too."""
+        return self.base_opacity is not None
+
+    @property
     def residual(self) -> Float[Tensor, "h w 3"]:
         """What the pose-dependent branch adds."""
         return self.color - self.base
@@ -125,14 +130,30 @@ def orbit(
         start: angle of the first one from the body's front, radians.
     """
     vertices = posed.body.vertices.detach().cpu()
-    middle = (vertices.amin(0) + vertices.amax(0)) / 2
     axis = body_up(posed) if up is None else up
+    hips = posed.body.joints.detach().cpu()
+    across = hips[1] - hips[2]
+    yield from orbit_around(vertices, size, views, axis, torch.linalg.cross(across, axis), start)
+
+
+def orbit_around(
+    vertices: Float[Tensor, "V 3"], size: int, views: int, axis: Float[Tensor, "3"], front: Float[Tensor, "3"],
+    start: float = 0.0,
+) -> Iterator[Camera]:  # fmt: skip
+    """Cameras on a circle around some points; see `orbit`.
+
+    Args:
+        vertices: to have in view, metres.
+        size: edge of the square images, pixels.
+        views: how many, evenly spaced.
+        axis: of the circle, a unit vector; up in the images.
+        front: from where the first camera looks; need not be at right angles to the axis.
+        start: angle of the first one from there, radians.
+    """
+    middle = (vertices.amin(0) + vertices.amax(0)) / 2
     reach = float((vertices - middle).norm(dim=-1).max()) + 0.05
     focal = 1.8 * size
     away = reach * (focal / (size / 2)) * 1.06
-    hips = posed.body.joints.detach().cpu()
-    across = hips[1] - hips[2]
-    front = torch.linalg.cross(across, axis)
     front = torch.nn.functional.normalize(front - (front @ axis) * axis, dim=0)
     side = torch.linalg.cross(axis, front)
     intrinsics = torch.tensor([[focal, 0.0, (size - 1) / 2], [0.0, focal, (size - 1) / 2], [0.0, 0.0, 1.0]])

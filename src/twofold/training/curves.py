@@ -23,6 +23,23 @@ _MAX_BYTES = 256 * 2**20
 """Of a table; a million rows of ten values have half as many."""
 
 
+def read_curves(folder: Path) -> list[dict[str, float]]:
+    """The points of a run's table, each with its "step" and values by name.
+
+    Raises:
+        TwofoldError: it is missing or damaged.
+    """
+    file = folder / CURVES
+    try:
+        lines = io.StringIO(read_text(file, _MAX_BYTES), newline="")
+        rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(lines)]
+        if any("step" not in row for row in rows):
+            raise KeyError("step")
+    except (ValueError, TypeError, KeyError, csv.Error):
+        raise TwofoldError(f"{file} is damaged; remove it and resume again.") from None
+    return rows
+
+
 class Curves:
     """Losses over time, as a table that is written whole before every checkpoint, and for TensorBoard.
 
@@ -40,12 +57,7 @@ class Curves:
         self.file = folder / CURVES
         self.rows: list[dict[str, float]] = []
         if start and self.file.is_file():
-            try:
-                lines = io.StringIO(read_text(self.file, _MAX_BYTES), newline="")
-                rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(lines)]
-                self.rows = [row for row in rows if row["step"] <= start]
-            except (ValueError, TypeError, KeyError, csv.Error):
-                raise TwofoldError(f"{self.file} is damaged; remove it and resume again.") from None
+            self.rows = [row for row in read_curves(folder) if row["step"] <= start]
         board = folder / "tensorboard"
         board.mkdir(exist_ok=True)
         events = board / f"events.out.tfevents.{time.time_ns()}.{os.getpid()}"

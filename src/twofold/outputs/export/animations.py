@@ -18,39 +18,46 @@ WEIGHED = 60
 """Frames of a motion for which the morph targets' weights are worked out; those between are interpolated."""
 
 
-def capture_clip(baked: Baked, name: str = "capture") -> Animation:
-    """The training motion in the capture's world, with the learned corrections of its poses."""
+def capture_clip(baked: Baked, name: str = "capture", weighed: int = WEIGHED) -> Animation:
+    """The training motion in the capture's world, with the learned corrections of its poses; see `motion_clip`."""
     times = sorted({frame.frame_index for frame in baked.capture.train})
-    return _clip(baked, name, training_poses(baked.capture), np.array(times) / baked.capture.fps)
+    return _clip(baked, name, training_poses(baked.capture), np.array(times) / baked.capture.fps, weighed)
 
 
-def motion_clip(baked: Baked, motion: Motion) -> Animation:
-    """Any motion of the body as a clip, with the weights that the field gives the morph targets in its poses."""
+def motion_clip(baked: Baked, motion: Motion, weighed: int = WEIGHED) -> Animation:
+    """Any motion of the body as a clip, with the weights that the field gives the morph targets in its poses.
+
+    Args:
+        baked: from `bake`.
+        motion: y up.
+        weighed: frames for which these weights are worked out; those between are interpolated.
+    """
     poses, translations = motion.poses.float(), motion.translations.float()
     frames = [Pose(pose, place, None) for pose, place in zip(poses, translations, strict=True)]
-    return _clip(baked, motion.name, frames, np.arange(len(frames)) / motion.fps)
+    return _clip(baked, motion.name, frames, np.arange(len(frames)) / motion.fps, weighed)
 
 
 @torch.no_grad()
-def _clip(baked: Baked, name: str, frames: Sequence[Pose], times: np.ndarray) -> Animation:
+def _clip(baked: Baked, name: str, frames: Sequence[Pose], times: np.ndarray, weighed: int = WEIGHED) -> Animation:
     shape, avatar = baked.shape, baked.avatar
     fitted = {frame.frame_index: row for row, frame in enumerate(shape.frames) if frame.frame_index is not None}
     row_of = [None if frame.frame_index is None else fitted.get(frame.frame_index) for frame in frames]
-    asked = set(spread([index for index, row in enumerate(row_of) if row is None], WEIGHED))
+    asked = set(spread([index for index, row in enumerate(row_of) if row is None], weighed)) if weighed else set[int]()
+    corrected = bool(avatar.pose_corrections())
     poses, places = [], []
     weights: dict[int, np.ndarray] = {}
     for index, frame in enumerate(frames):
         row = row_of[index]
-        if frame.frame_index is None and index not in asked:
+        if row is not None:
+            weights[index] = shape.weights[row].cpu().numpy()
+        if index not in asked and (frame.frame_index is None or not corrected):
             poses.append(frame.pose.cpu().numpy())  # nothing corrects it, and nothing is to be asked there
             places.append(frame.translation.cpu().numpy())
             continue
         posed = frame.of(avatar)
         poses.append(posed.body.pose.cpu().numpy())
         places.append((posed.body.joints[0] - shape.skin.rest.joints[0]).cpu().numpy())
-        if row is not None:
-            weights[index] = shape.weights[row].cpu().numpy()
-        elif index in asked:
+        if index in asked:
             weights[index] = shape.weights_at(avatar, posed, baked.config.branch).cpu().numpy()
     rows, given = np.arange(len(frames)), sorted(weights)
     table = np.stack([weights[index] for index in given])

@@ -106,11 +106,9 @@ def bake(
     Raises:
         TwofoldError: there is no such frame, no surface, or a package is missing.
     """
-    frame = None if isinstance(color, str) else frame_at(capture, color)
-    kind: dict[str, object] = {
-        "faces": config.faces, "branch": config.branch, "targets": config.targets, "frames": config.frames,
-        "color_frames": config.color_frames,
-    }  # fmt: skip
+    if not isinstance(color, str):
+        frame_at(capture, color)
+    kind = _settings(config)
     shape = kept(
         cache, "shape", kind, shape_codec(rest_body(avatar)),
         lambda: bake_shape(avatar, training_poses(capture), config, lambda done, note: progress(0.5 * done, note)),
@@ -119,14 +117,12 @@ def bake(
     atlas: Atlas | None = None
     if config.texture:
         progress(0.5, "atlas")
-        kind["texture"] = config.texture
-        atlas = kept(cache, "atlas", kind, atlas_codec(len(vertices)), lambda: unwrap(vertices, faces, config.texture))
+        wanted = kind | {"texture": config.texture}
+        atlas = kept(
+            cache, "atlas", wanted, atlas_codec(len(vertices)), lambda: unwrap(vertices, faces, config.texture)
+        )
     progress(0.65, "colours")
-    kind |= {"color": color, "lit": config.lit}
-    paint = kept(
-        cache, "paint", kind, paint_codec(len(vertices)),
-        lambda: _paint(avatar, capture, config, shape, atlas, frame or color, progress),
-    )  # fmt: skip
+    paint = _paint(avatar, capture, config, shape, atlas, color, progress, cache)
     character = Character(
         name=name,
         vertices=vertices,
@@ -143,7 +139,21 @@ def bake(
         observed=paint.observed,
     )
     progress(1.0, "")
-    return Baked(avatar, capture, config, replace(shape, shown=()), character)
+    return Baked(avatar, capture, config, shape, character)
+
+
+def _settings(config: BakeConfig) -> dict[str, object]:
+    """What a stored shape depends on."""
+    return {
+        "faces": config.faces, "branch": config.branch, "targets": config.targets, "frames": config.frames,
+    }  # fmt: skip
+
+
+def recolored(baked: Baked, color: str | int, cache: BakeCache | None = None) -> Character:
+    """The same character in other colours; see `bake`."""
+    character = baked.character
+    paint = _paint(baked.avatar, baked.capture, baked.config, baked.shape, character.atlas, color, cache=cache)
+    return replace(character, colors=paint.colors, texture=paint.texture, normal_map=paint.normal_map)
 
 
 def _paint(
@@ -152,14 +162,33 @@ def _paint(
     config: BakeConfig,
     shape: BakedShape,
     atlas: Atlas | None,
-    color: str | Frame | int,
+    color: str | int,
+    progress: Progress = lambda _done, _note: None,
+    cache: BakeCache | None = None,
+) -> BakedColors:
+    """Colours of a shape, and with an atlas its texture and normal map, stored ones where there are; see `bake`."""
+    settings = _settings(config) | {
+        "texture": config.texture, "color_frames": config.color_frames, "color": color, "lit": config.lit,
+    }  # fmt: skip
+    return kept(
+        cache, "paint", settings, paint_codec(len(shape.skin.vertices)),
+        lambda: _painted(avatar, capture, config, shape, atlas, color, progress),
+    )  # fmt: skip
+
+
+def _painted(
+    avatar: Avatar,
+    capture: Capture,
+    config: BakeConfig,
+    shape: BakedShape,
+    atlas: Atlas | None,
+    color: str | int,
     progress: Progress,
 ) -> BakedColors:
-    """Colours of a shape, and with an atlas its texture and normal map; `color` as in `bake`, or a frame."""
     averaged = shown_surfaces(avatar, shape, config)
     shown: Shown = averaged
-    if isinstance(color, Frame):
-        posed = pose_of(capture, color).of(avatar)
+    if isinstance(color, int):
+        posed = pose_of(capture, frame_at(capture, color)).of(avatar)
         shown = [(posed, pull_back(avatar, posed, shape.skin, config.branch))]
     vertices, faces = shape.skin.vertices.cpu().numpy(), shape.skin.faces.cpu().numpy()
     # The lattice is as fine for one pose as a texture shows, and coarser where many poses are averaged.

@@ -14,7 +14,7 @@ from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors, write_json
 from twofold.methods.base import Avatar
-from twofold.outputs.export.animations import capture_clip, grounded, motion_clip, turned, upright
+from twofold.outputs.export.animations import WEIGHED, capture_clip, grounded, motion_clip, turned, upright
 from twofold.outputs.export.bake import BakeConfig, Progress
 from twofold.outputs.export.bake_cache import BakeCache
 from twofold.outputs.export.character import Animation, Character
@@ -70,7 +70,7 @@ def require_exportable(request: ExportRequest, capture: Capture) -> None:
 
 
 @torch.no_grad()
-def _require_field(avatar: Avatar) -> None:
+def require_surface(avatar: Avatar) -> None:
     """Refuses methods whose surface cannot be asked for in canonical space, by the sentence of what they lack."""
     if avatar.level_space != "canonical":
         raise TwofoldError(f"{type(avatar).__name__} has no surface in canonical space to export; render it instead.")
@@ -107,9 +107,7 @@ def export(
         TwofoldError: see `require_exportable`; the avatar has no surface; the disk refuses.
     """
     require_exportable(request, capture)
-    _require_field(avatar)
-    with plain_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    require_surface(avatar)
     start = time.monotonic()
     options = request.options
     baked = bake(
@@ -124,25 +122,60 @@ def export(
         character = still(baked, request.frame, lambda x: x @ rotation.T.to(x))
     elif any(EXPORTERS[name].holds != "mesh" for name in request.formats):
         progress(0.88, "motions")
-        character = replace(character, clips=tuple(_clips(baked, request.capture_motion, request.motions)))
-    written: list[Path] = []
-    for name in request.formats:
-        progress(0.95, name)
-        own = standing(character) if EXPORTERS[name].holds == "mesh" and character.rigged else character
-        EXPORTERS[name].write(own, folder / f"{stem}.{name}", options)
-        written.append(folder / f"{stem}.{name}")
-    write_json(folder / RECORD, record(baked, character, written, seconds))
+        clips = clips_of(baked, request.capture_motion, request.motions)
+        character = replace(character, clips=tuple(clips))
+    progress(0.95, "files")
+    written = write_character(baked, character, folder, request.formats, options, stem, seconds)
     progress(1.0, "")
     return written
 
 
-def _clips(baked: Baked, capture_motion: bool, motions: Sequence[Motion]) -> list[Animation]:
+def write_character(
+    baked: Baked, character: Character, folder: Path, formats: Sequence[str], options: ExportOptions,
+    stem: str = "avatar", seconds: float | None = None,
+) -> list[Path]:  # fmt: skip
+    """Writes a character's files into a folder, and `export.json`.
+
+    Args:
+        baked: that it came from.
+        character: with its clips, or a still mesh.
+        folder: made where it is missing.
+        formats: keys of `EXPORTERS`.
+        options: of the files.
+        stem: of their names.
+        seconds: that the bake took, for the record.
+
+    Raises:
+        TwofoldError: the disk refuses.
+    """
+    with plain_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    for name in formats:
+        own = standing(character) if EXPORTERS[name].holds == "mesh" and character.rigged else character
+        EXPORTERS[name].write(own, folder / f"{stem}.{name}", options)
+        written.append(folder / f"{stem}.{name}")
+    write_json(folder / RECORD, record(baked, character, written, seconds))
+    return written
+
+
+def clips_of(baked: Baked, capture_motion: bool, motions: Sequence[Motion], weighed: int = WEIGHED) -> list[Animation]:
+    """The clips of a character, upright and on the ground.
+
+    Args:
+        baked: from `bake`.
+        capture_motion: whether the capture's own motion comes first.
+        motions: further motions.
+        weighed: frames of each motion, besides those that the targets were fitted to, for which the targets' weights
+            are worked out.
+    """
     character, pelvis = baked.character, baked.character.joints[0]
     clips: list[Animation] = []
     if capture_motion:
-        clips.append(grounded(turned(capture_clip(baked), upright(baked.capture), pelvis), character))
+        own = capture_clip(baked, weighed=weighed)
+        clips.append(grounded(turned(own, upright(baked.capture), pelvis), character))
     for motion in motions:
-        clips.append(grounded(motion_clip(baked, motion), character))
+        clips.append(grounded(motion_clip(baked, motion, weighed), character))
     return clips
 
 
@@ -152,7 +185,7 @@ def standing(character: Character) -> Character:
     return replace(character, vertices=lifted, targets=character.targets[:0], clips=(), rigged=False)
 
 
-def record(baked: Baked, character: Character, written: Sequence[Path], seconds: float) -> dict[str, object]:
+def record(baked: Baked, character: Character, written: Sequence[Path], seconds: float | None) -> dict[str, object]:
     """What an export holds and how good it is, for `export.json` and the report."""
     observed = baked.character.observed
     return {
@@ -166,7 +199,7 @@ def record(baked: Baked, character: Character, written: Sequence[Path], seconds:
         "lit": character.lit,
         "clips": {clip.name: len(clip.times) for clip in character.clips},
         "observed_share": None if observed is None else float((observed > 0).mean()),
-        "bake_seconds": round(seconds, 1),
+        "bake_seconds": None if seconds is None else round(seconds, 1),
         "about": {
             "morph_errors_mm": "RMS distance from the full surface of each frame pulled back through the skinning; "
             "targets fitted without every fifth frame, which are the left-out ones",

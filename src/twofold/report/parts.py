@@ -1,7 +1,7 @@
 """One HTML page that shows a run: metrics, images, curves, tables, videos, and how to go on.
 
-The page needs nothing else but its videos, which lie beside it: style and images are inside, there is no script, and
-it follows the reader's choice of light or dark.
+The page is one file: style, images, videos and the interactive character are inside, and nothing is loaded from
+anywhere. It follows the reader's choice of light or dark.
 """
 
 import itertools
@@ -11,14 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from twofold.errors import TwofoldError
 from twofold.files import write_bytes
+from twofold.html.character import InteractiveCharacter, client_script, content_policy, script_credit
 from twofold.html.charts import Chart, Curve, curves_svg
-from twofold.html.page import EmbeddedImage, KeyMetric, Table, embedded_image, render
+from twofold.html.page import EmbeddedImage, KeyMetric, Table, embedded_image, embedded_video, render
 from twofold.outputs.sheets import SheetImage, as_bytes
 
 __all__ = [
-    "CaptionedImage", "Chart", "Commands", "Curve", "KeyMetric", "Row", "Section", "Table", "Video",
+    "CaptionedImage", "Chart", "Commands", "Curve", "InteractiveCharacter", "KeyMetric", "Row", "Section", "Table",
+    "Video",
     "key_metric", "metrics_table", "number", "write_report",
 ]  # fmt: skip
 
@@ -29,25 +30,30 @@ MISSING = "\N{EN DASH}"
 
 @dataclass(frozen=True)
 class CaptionedImage:
-    """An image, put into the page, with a caption: a file (PNG, JPEG, WebP) or colours."""
+    """An image, put into the page, with a caption: a file (PNG, JPEG, WebP) or colours.
+
+    Colours are stored as JPEG where `small`, and exactly otherwise.
+    """
 
     image: Path | SheetImage
     caption: str = ""
+    small: bool = False
 
 
 @dataclass(frozen=True)
 class Row:
-    """Images to be compared side by side; on a phone they scroll sideways together."""
+    """Images to be compared side by side; on a phone they scroll sideways together, or stand below each other."""
 
     images: tuple[CaptionedImage, ...]
     label: str = ""
+    wrapped: bool = False
 
 
 @dataclass(frozen=True)
 class Video:
-    """A video in the page's folder or below, named by its path from there."""
+    """A video (MP4), put into the page: a path, or one from the page's folder."""
 
-    file: str
+    file: str | Path
     caption: str = ""
 
 
@@ -58,8 +64,11 @@ class Commands:
     lines: tuple[tuple[str, str], ...]
 
 
-Part: TypeAlias = Row | Video | Chart | Table | Commands
-BOXES: dict[type, str] = {Row: "rows", Video: "videos", Chart: "charts", Table: "tables", Commands: "commands"}
+Part: TypeAlias = Row | Video | Chart | Table | Commands | InteractiveCharacter
+BOXES: dict[type, str] = {
+    Row: "rows", Video: "videos", Chart: "charts", Table: "tables", Commands: "commands",
+    InteractiveCharacter: "characters",
+}  # fmt: skip
 """What a template calls a group of parts of one kind."""
 
 
@@ -84,9 +93,9 @@ def write_report(
     """Writes `report.html` into a folder and returns its path.
 
     Args:
-        folder: exists; the videos lie in it.
+        folder: exists; videos may lie in it.
         title: of the page.
-        sections: in order.
+        sections: in order; at most one of their parts is an interactive character.
         subtitle: one line under the title: capture, recipe, time.
         key_metrics: the numbers to see first.
         lead: an image or video beside the title.
@@ -95,20 +104,22 @@ def write_report(
     Raises:
         TwofoldError: a video or image is missing, or the page cannot be written.
     """
-    videos = [p for s in sections for p in s.parts if isinstance(p, Video)]
-    for video in [*videos, *([lead] if isinstance(lead, Video) else [])]:
-        if not (folder / video.file).is_file():
-            raise TwofoldError(f"The report's video {folder / video.file} is missing; render it first.")
+    interactive = any(isinstance(part, InteractiveCharacter) for section in sections for part in section.parts)
+    script = client_script() if interactive else None
     content = render(
         "report.html",
         title=title,
         subtitle=subtitle,
         key_metrics=key_metrics,
-        lead=_embedded(lead) if isinstance(lead, CaptionedImage) else lead,
+        lead=None if lead is None else _shown(lead, folder),
+        lead_is_video=isinstance(lead, Video),
         sections=[
-            {"heading": section.heading, "text": section.text, "boxes": _boxes(section.parts)} for section in sections
+            {"heading": section.heading, "text": section.text, "boxes": _boxes(section.parts, folder)}
+            for section in sections
         ],
-        credit=credit,
+        credit=f"{credit}\n\n{script_credit()}" if interactive else credit,
+        script=script,
+        policy=content_policy(script),
     )
     path = folder / FILE_NAME
     write_bytes(path, content)
@@ -180,18 +191,22 @@ def _metric_rows(metrics: Mapping[str, object], heading: str) -> Iterator[tuple[
         yield from _metric_rows(entry, f"{heading}, {name.lower()}" if heading else name)
 
 
-def _boxes(parts: Sequence[Part]) -> list[dict[str, Any]]:
+def _boxes(parts: Sequence[Part], folder: Path) -> list[dict[str, Any]]:
     """Parts of one kind that follow each other share a box, so that charts stand side by side."""
     return [
-        {"kind": BOXES[kind], "parts": [_shown(part) for part in group]}
+        {"kind": BOXES[kind], "parts": [_shown(part, folder) for part in group]}
         for kind, group in itertools.groupby(parts, type)
     ]
 
 
-def _shown(part: Part) -> object:
-    """What the template shows of a part: its images embedded, its curves drawn."""
+def _shown(part: Part | CaptionedImage, folder: Path) -> object:
+    """What the template shows of a part: its images and videos embedded, its curves drawn."""
+    if isinstance(part, CaptionedImage):
+        return _embedded(part)
+    if isinstance(part, Video):
+        return embedded_video(folder / part.file, part.caption)
     if isinstance(part, Row):
-        return {"label": part.label, "images": [_embedded(image) for image in part.images]}
+        return {"label": part.label, "wrapped": part.wrapped, "images": [_embedded(image) for image in part.images]}
     if isinstance(part, Chart):
         legend = [curve.name for curve in part.curves] if len(part.curves) > 1 else []
         return {"title": part.title, "svg": curves_svg(part), "legend": legend}
@@ -200,4 +215,4 @@ def _shown(part: Part) -> object:
 
 def _embedded(image: CaptionedImage) -> EmbeddedImage:
     content = image.image if isinstance(image.image, Path) else as_bytes(image.image)
-    return embedded_image(content, image.caption)
+    return embedded_image(content, image.caption, "jpeg" if image.small else "png")

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from twofold.errors import TwofoldError
-from twofold.report import (
+from twofold.report.parts import (
     CaptionedImage,
     Chart,
     Commands,
@@ -40,7 +40,7 @@ METRICS = {
     "seconds": {"total": 151.26},
     "recipe": "quick",
 }
-VOID = {"meta", "img", "br", "path", "link"}
+VOID = {"meta", "img", "br", "path", "link", "input"}
 
 
 class Page(HTMLParser):
@@ -125,7 +125,7 @@ def test_page_shows_all_it_was_given(tmp_path: Path) -> None:
         assert words in page.text, words
     assert len(page.all("svg")) == 1 + 2, "the logo and two charts"
     assert [a["href"] for a in page.all("a")] == ["https://example.org/a"]
-    assert page.all("video")[0]["src"] == "films/a%20turn.mp4"
+    assert page.all("video")[0]["src"] == "data:video/mp4;base64," + base64.b64encode(b"film").decode()
 
 
 def test_images_are_inside_the_page_pixel_by_pixel(tmp_path: Path) -> None:
@@ -145,7 +145,10 @@ def test_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
     assert not page.all("script")
     assert not page.all("link")
     sources = [str(a.get("src", "")) for _, a in page.elements if "src" in a]
-    assert all(s.startswith(("data:", "films/")) for s in sources)
+    assert all(s.startswith("data:") for s in sources)
+    (policy,) = [a["content"] for a in page.all("meta") if a.get("http-equiv") == "Content-Security-Policy"]
+    assert policy.startswith("default-src 'none';")
+    assert "script-src" not in policy
     style = "".join(page.texts)
     assert "url(" not in style
     assert "@import" not in style
