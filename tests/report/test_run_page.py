@@ -14,12 +14,12 @@ from test_parts import Page
 
 from twofold.capture.types import Capture
 from twofold.cli.main import main
-from twofold.html.character import client_script
+from twofold.html.interactive import client_script
 from twofold.methods.table import RECIPES, with_settings
 from twofold.outputs.sheets import error_map
 from twofold.outputs.views import RenderedImage
-from twofold.report.character import joint_controls
-from twofold.report.images import HeldOut, branches_row, enlarged, one_each
+from twofold.report.page_character import joint_controls
+from twofold.report.page_images import HeldOut, branches_row, enlarged, one_each
 from twofold.report.run_page import training_command
 
 HOSTS = re.compile(r"https?://", re.IGNORECASE)
@@ -86,13 +86,13 @@ def test_stored_metrics_are_taken_as_they_are(
     written: tuple[Path, Page], trained, person_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from twofold import evaluation
-    from twofold.report import character
+    from twofold.report import page_character
 
     run = tmp_path / "run"
     shutil.copytree(trained.folder, run)
     (run / "metrics.json").write_text(json.dumps({"novel_view": {"psnr_box": 12.345, "protocol": "by hand"}}))
     monkeypatch.setattr(evaluation, "evaluate", None)
-    monkeypatch.setattr(character, "missing_packages", lambda config: ["xatlas"])
+    monkeypatch.setattr(page_character, "missing_packages", lambda config: ["xatlas"])
     small = ["--size", "64", "--frames", "1", "--mesh"]
     main(["report", str(run), "--capture", str(person_folder), "--out", str(tmp_path / "a.html"), *small])
     page = Page((tmp_path / "a.html").read_text())

@@ -13,11 +13,11 @@ from characters import small_character
 from devtools import NOT_FROM_ELSEWHERE, Tab, browser_tab
 from PIL import Image
 
-from twofold.html.character import InteractiveCharacter
+from twofold.html.interactive import InteractiveCharacter
 from twofold.outputs.export.character import Animation, pose_character
 from twofold.outputs.export.gltf import glb_bytes, gltf_document
 from twofold.outputs.export.options import ExportOptions
-from twofold.report.character import _jpeg, joint_controls, poster
+from twofold.report.page_character import _jpeg, joint_controls, poster
 from twofold.report.parts import CaptionedImage, Row, Section, write_report
 
 READY = "document.querySelector('[data-character].ready') !== null"

@@ -22,8 +22,8 @@ from twofold.outputs.export.options import ExportOptions
 from twofold.outputs.export.write import write_character
 from twofold.outputs.gallery import comparison_sheet, save_png
 from twofold.recipe import Recipe
-from twofold.report.character import PageCharacter, builtin_motions, lacking, page_character
-from twofold.report.images import (
+from twofold.report.page_character import PageCharacter, builtin_motions, lacking, page_character
+from twofold.report.page_images import (
     SPLITS,
     HeldOut,
     canonical_images,

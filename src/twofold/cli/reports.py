@@ -54,7 +54,7 @@ def report(
     """
     from twofold.capture.folder import read_capture
     from twofold.outputs.export.bake_cache import open_cache
-    from twofold.report.character import PAGE, PageCharacter, lacking, page_character
+    from twofold.report.page_character import PAGE, PageCharacter, lacking, page_character
     from twofold.report.run_page import PageOptions, render_images, run_texts, write_page
     from twofold.training.run import choose_device, find_capture, load, require_same
 

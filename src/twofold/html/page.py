@@ -1,7 +1,7 @@
 """HTML pages from the templates of this package: Jinja2 with every text escaped, style and images inside the page.
 
 A page needs nothing else and asks no host for anything; it has no script but that of the interactive character
-(`twofold.html.character`), is readable on a phone, and follows the reader's choice of light or dark.
+(`twofold.html.interactive`), is readable on a phone, and follows the reader's choice of light or dark.
 """
 
 import base64

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from twofold.files import write_bytes
-from twofold.html.character import InteractiveCharacter, client_script, content_policy, script_credit
 from twofold.html.charts import Chart, Curve, curves_svg
+from twofold.html.interactive import InteractiveCharacter, client_script, content_policy, script_credit
 from twofold.html.page import EmbeddedImage, KeyMetric, Table, embedded_image, embedded_video, render
 from twofold.outputs.sheets import SheetImage, as_bytes
 

@@ -12,8 +12,8 @@ from twofold.methods.base import Avatar
 from twofold.methods.table import RECIPES
 from twofold.outputs.shares import Shares
 from twofold.recipe import Recipe
-from twofold.report import images as own
-from twofold.report.character import PageCharacter
+from twofold.report import page_images as own
+from twofold.report.page_character import PageCharacter
 from twofold.report.parts import (
     Chart,
     Commands,

@@ -16,7 +16,7 @@ from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
 from twofold.geometry.rotations import axis_angle_to_matrix
-from twofold.html.character import InteractiveCharacter, JointControl
+from twofold.html.interactive import InteractiveCharacter, JointControl
 from twofold.html.page import EmbeddedImage, embedded_image
 from twofold.methods.base import Avatar
 from twofold.outputs.export.bake import BakeConfig, Progress

@@ -17,7 +17,7 @@ from twofold.outputs.gallery import around_person, motion_frames, orbit_frames, 
 from twofold.outputs.sheets import ERROR_RANGE, as_bytes, error_map
 from twofold.outputs.video import write_video
 from twofold.outputs.views import RenderedImage, orbit, pose_canonically, render_image
-from twofold.report.character import PageCharacter, mesh_orbit
+from twofold.report.page_character import PageCharacter, mesh_orbit
 from twofold.report.parts import CaptionedImage, Row, Video
 
 SPLITS = {"novel_view": "Novel views", "novel_pose": "Novel poses"}

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from twofold.html import character
-from twofold.html.character import (
+from twofold.html import interactive
+from twofold.html.interactive import (
     SCRIPT,
     VENDOR,
     VERSIONS,
@@ -23,7 +23,7 @@ from twofold.html.character import (
 )
 from twofold.html.page import render
 
-CLIENT = Path(character.__file__).parent / "client"
+CLIENT = Path(interactive.__file__).parent / "client"
 EVIL = "</script><script>alert(1)</script><!--\"'"
 PART = InteractiveCharacter(
     b"glTF\x02\0\0\0", "ada.glb", ("walk", "dance"), (JointControl("left knee", ((-5, 150), (-20, 20), (-15, 15))),)
@@ -84,7 +84,7 @@ def test_base_colours_are_offered_where_there_are_some() -> None:
 
 def test_a_script_that_would_end_its_element_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / SCRIPT).write_text("a = '</SCRIPT>'")
-    monkeypatch.setattr(character, "VENDOR", tmp_path)
+    monkeypatch.setattr(interactive, "VENDOR", tmp_path)
     with pytest.raises(ValueError, match="make vendor"):
         client_script.__wrapped__()
 
