@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from twofold.body.skeleton import PosedBody
 from twofold.config import require_within
+from twofold.field.fused import FusedField, Net
 from twofold.field.grids import (
     FeatureGrid,
     Lattices,
@@ -88,13 +89,18 @@ class SmallNet(nn.Module):
 
     def forward(self, x: Tensor, condition: Tensor | None) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """Outputs and the tape that `pullback` needs."""
+        first, bias, *_ = self.at(condition)
+        a = F.relu(F.linear(x, first, bias))
+        b = F.relu(self.second(a))
+        return self.last(b), (a, b)
+
+    def at(self, condition: Tensor | None) -> Net:
+        """Weight and bias of each layer, with the condition in the first bias."""
         bias = self.first.bias
         if self.condition is not None and condition is not None:
             # One pose a call: its part of the first layer is a bias, not a column of every sample.
             bias = bias + self.condition(condition)
-        a = F.relu(F.linear(x, self.first.weight, bias))
-        b = F.relu(self.second(a))
-        return self.last(b), (a, b)
+        return self.first.weight, bias, self.second.weight, self.second.bias, self.last.weight, self.last.bias
 
     def pullback(self, tape: tuple[Tensor, Tensor], cotangent: Tensor) -> Tensor:
         """Cotangent of the input from that of the output."""
@@ -213,6 +219,20 @@ class GridField(nn.Module):
                 g.g = slope + g2 if alone else g.g1 + g.gate[:, None] * g2
         return g
 
+    def _fused(self, x: Tensor, pose: Tensor) -> FusedField | None:
+        """The field at a pose as one compiled operation, where that exists: both branches, float32, on a CPU."""
+        config = self.config
+        plain = config.branches == "both" and config.share_features and config.pose_into == "high"
+        if not plain or x.is_cuda or x.dtype != torch.float32 or self.light.weight.dtype != torch.float32:
+            return None
+        code = self.pose_code(pose)
+        nets = tuple(net.at(code) for net in (self.low_sdf, self.low_color, self.high_sdf, self.high_color))
+        prior = Lattices(*(self.get_buffer(f"prior_{name}") for name in ("rows", "place", "shape")))
+        width = float("inf") if config.gate_width is None else config.gate_width
+        lattices = (prior, self.low_grid.lattices, self.high_grid.lattices)
+        tables = (self.get_buffer("prior"), self.low_grid.table, self.high_grid.table)
+        return FusedField(*tables, lattices, nets, width)  # type: ignore[arg-type]
+
     def _gate(self, s1: Tensor) -> Tensor:
         if self.config.gate_width is None:
             return torch.ones_like(s1)
@@ -220,12 +240,18 @@ class GridField(nn.Module):
 
     def sdf(self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> Float[Tensor, "S"]:
         """Signed distance alone, metres."""
-        return self._geometry(x, pose, "none").s
+        fused = self._fused(x, pose)
+        if fused is None:
+            return self._geometry(x, pose, "none").s
+        return fused.distance_and_gradient(x)[0] if torch.is_grad_enabled() else fused.sdf(x)
 
     def distance_and_gradient(
         self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
     ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
         """Signed distance and its canonical gradient, both differentiable by the parameters."""
+        fused = self._fused(x, pose)
+        if fused is not None:
+            return fused.distance_and_gradient(x)
         out = self._geometry(x, pose, "trained")
         return out.s, out.g
 
@@ -240,6 +266,11 @@ class GridField(nn.Module):
             to_observation: turns canonical gradients into those of observation space; None leaves them.
         """
         # Normals enter the colours as constants: the shape learns from densities, at half the cost.
+        fused = self._fused(x, pose)
+        if fused is not None:
+            turn = torch.eye(3).expand(len(x), 3, 3) if to_observation is None else to_observation
+            s, c, g, s1, c1, g1 = fused.colors(x, turn, self.light.weight)
+            return FieldOutput(s, c, g, FieldOutput(s1, c1, g1))
         g = self._geometry(x, pose, "constant")
         base, plain = self._unlit_colors(x, g)
         below = None if base is None else FieldOutput(g.s1, base * self._light(g.g1, to_observation), g.g1)

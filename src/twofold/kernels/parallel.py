@@ -5,11 +5,13 @@ import inspect
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import Any, final
+from typing import Any, TypeVar, final
 
 import numba
 import torch
 from numba.core.caching import FunctionCache
+
+Result = TypeVar("Result")
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -48,7 +50,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="twofold")
 
 
-def in_parts(count: int, work: Callable[[int, int], object], least: int = 1024) -> list[object]:
+def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) -> list[Result]:
     """Calls `work(begin, end)` on parts of 0..count, side by side; `work` must let go of the interpreter's lock.
 
     Args:
