@@ -9,6 +9,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -19,7 +20,7 @@ from twofold.cli.advice import after_evaluation, after_rendering, require_captur
 from twofold.cli.captures import check, import_capture, prepare, studio
 from twofold.cli.console import ALONE, bar, console, say, within
 from twofold.cli.exports import export
-from twofold.cli.motions import NO_MOTION, MotionView, motion, render_motion
+from twofold.cli.motions import NO_MOTION, MotionView, motion, render_by_mesh, render_motion
 from twofold.cli.protocol_table import networks_asked_for, print_protocols
 from twofold.cli.reports import report
 from twofold.cli.streams import streams_that_never_fail
@@ -170,10 +171,11 @@ def render(
     if motion_video.motion is not None:
         render_motion(run, motion_video, size, out, chunk, device, capture)
         return
-    if motion_video != NO_MOTION:
-        raise TwofoldError(
-            "--mesh, --follow, --fps, --up, --units, --start-at-origin, --background and --alpha need --motion."
-        )
+    if motion_video != replace(NO_MOTION, mesh=motion_video.mesh):
+        raise TwofoldError("--follow, --fps, --up, --units, --start-at-origin, --background and --alpha need --motion.")
+    if motion_video.mesh:
+        render_by_mesh(run, what, size, out, device, capture)
+        return
     avatar, _ = load(run, choose_device(device))
     source = find_capture(run, capture)
     require_capture(source)

@@ -17,7 +17,7 @@ class MotionView:
     motion: str | None = None
     """Renders a motion instead: a .bvh or .npz file (AMASS, SMPL, AIST++), or walk, turn, dance, range-of-motion."""
     mesh: bool = False
-    """Renders the baked mesh instead of the field: quick, after half a minute of baking."""
+    """Renders the baked mesh instead of the field: quick, after half a minute of baking. Also without --motion."""
     follow: bool = False
     """The camera goes along; otherwise it stands where it sees the whole motion."""
     fps: float | None = None
@@ -86,6 +86,32 @@ def motion(
         renderer = body_renderer(shaped, moved, color)
         write_motion(path, moved.fps, cameras, renderer, color, progress=lambda done: progress(done, ""))
     say(f"The preview is {path}.", f"twofold render RUN --motion {source}")
+
+
+def render_by_mesh(run: Path, what: str, size: int, out: Path | None, device: str, capture: Path | None) -> None:
+    """Renders orbit, novel poses, front and back from the baked mesh; see `twofold render`."""
+    from twofold.capture.folder import read_capture
+    from twofold.outputs.export.bake_cache import open_cache
+    from twofold.outputs.export.make import bake
+    from twofold.outputs.export.write import require_packages, require_surface
+    from twofold.outputs.mesh_gallery import render_run_by_mesh
+    from twofold.outputs.mesh_motion import CONFIG
+    from twofold.training.run import choose_device, find_capture, load, require_same
+
+    require_packages(CONFIG)
+    avatar, _ = load(run, choose_device(device))
+    require_surface(avatar)
+    source = find_capture(run, capture)
+    require_capture(source)
+    read = read_capture(source)
+    require_same(run, read, motion=True)
+    with bar("Baking") as progress:
+        baked = bake(avatar, read, CONFIG, progress=progress, cache=open_cache(run, read, tell))
+    folder = out or run / "renders"
+    with bar("Rendering") as progress:
+        written = render_run_by_mesh(baked, read, folder, what, size, lambda done: progress(done, ""))
+    names = ", ".join(path.name for path in written)
+    say(f"{names} in {folder}, by the mesh renderer.", f"twofold render {run}, for the field's own, finer images")
 
 
 def render_motion(

@@ -65,8 +65,7 @@ def require_exportable(request: ExportRequest, capture: Capture) -> None:
     for frame in (request.frame, request.color):
         if isinstance(frame, int):
             frame_at(capture, frame)
-    if missing := missing_packages(request.config):
-        raise TwofoldError(f"Exporting needs {' and '.join(missing)}; run pip install 'twofold[export]'.")
+    require_packages(request.config)
 
 
 @torch.no_grad()
@@ -77,6 +76,16 @@ def require_surface(avatar: Avatar) -> None:
     posed = avatar.pose(torch.zeros(24, 3), torch.zeros(3))
     x, matrix = avatar.to_canonical(posed.body.vertices[:1], posed)
     avatar.query(x, posed, matrix)
+
+
+def require_packages(config: BakeConfig) -> None:
+    """Refuses to bake without the packages for it.
+
+    Raises:
+        TwofoldError: names those that are missing.
+    """
+    if missing := missing_packages(config):
+        raise TwofoldError(f"Baking a mesh needs {' and '.join(missing)}; run pip install 'twofold[export]'.")
 
 
 def missing_packages(config: BakeConfig) -> list[str]:
