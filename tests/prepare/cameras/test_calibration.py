@@ -15,7 +15,7 @@ from twofold.geometry.cameras import project
 from twofold.prepare.cameras.calibration import (
     distort,
     for_pictures,
-    largest_distortion,
+
     match_cameras,
     pinhole,
     undistort,

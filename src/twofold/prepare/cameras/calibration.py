@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
+from twofold.geometry.lens import distorted_pixels, image_undistorter, undistorted_pixels
 
 _CROPPED = 16
 """Video coders pad images to multiples of 16 pixels, and players cut that off again, right and below."""
@@ -164,33 +165,12 @@ def _rounded(camera: CalibratedCamera, height: int, width: int, across: float, d
 
 def distort(camera: CalibratedCamera, pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
     """Where the lens shows what a perfect one would show at `pixels` (column, row)."""
-    k1, k2, p1, p2, k3 = camera.distortion
-    plane = _to_plane(camera.intrinsics, pixels)
-    x, y = plane[..., 0], plane[..., 1]
-    r = x * x + y * y
-    radial = 1 + r * (k1 + r * (k2 + r * k3))
-    u = x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x)
-    v = y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y
-    return _to_pixels(camera.intrinsics, np.stack([u, v], -1))
+    return distorted_pixels(camera.intrinsics, camera.distortion, pixels)
 
 
 def undistort(camera: CalibratedCamera, pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
     """Where a perfect lens would show what this one shows at `pixels`: the inverse of `distort`, to 0.001 pixels."""
-    ideal = pixels.astype(np.float64)
-    if not camera.distortion.any():
-        return ideal
-    for _ in range(100):
-        step = pixels - distort(camera, ideal)
-        ideal = ideal + step
-        if not np.nanmax(np.abs(step), initial=0.0) > 1e-3:
-            break
-    return ideal
-
-
-def largest_distortion(camera: CalibratedCamera, height: int, width: int) -> float:
-    """How far the lens moves a point of an image of this size at most, pixels."""
-    grid = _grid(np.linspace(0, height - 1, 33), np.linspace(0, width - 1, 33))
-    return float(np.linalg.norm(distort(camera, grid) - grid, axis=-1).max())
+    return undistorted_pixels(camera.intrinsics, camera.distortion, pixels)
 
 
 def undistorter(
@@ -200,32 +180,7 @@ def undistorter(
 
     What no pixel showed repeats the nearest one. The images belong to `camera.without_distortion()`.
     """
-    source = distort(camera, _grid(np.arange(height), np.arange(width)))
-    across, down = 2 * source[..., 0] / max(width - 1, 1) - 1, 2 * source[..., 1] / max(height - 1, 1) - 1
-    where = torch.as_tensor(np.stack([across, down], -1)[None].astype(np.float32))
-
-    def undistort(image: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
-        planes = torch.as_tensor(image.astype(np.float32)).permute(2, 0, 1)[None]
-        moved = torch.nn.functional.grid_sample(planes, where, padding_mode="border", align_corners=True)
-        return moved[0].permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).numpy()
-
-    return undistort
-
-
-def _grid(rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "h w 2"]:
-    down, across = np.meshgrid(rows.astype(np.float64), columns.astype(np.float64), indexing="ij")
-    return np.stack([across, down], -1)
-
-
-def _to_plane(intrinsics: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Points on the plane at depth 1."""
-    y = (pixels[..., 1] - intrinsics[1, 2]) / intrinsics[1, 1]
-    x = (pixels[..., 0] - intrinsics[0, 2] - intrinsics[0, 1] * y) / intrinsics[0, 0]
-    return np.stack([x, y], -1)
-
-
-def _to_pixels(intrinsics: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    return plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
+    return image_undistorter(camera.intrinsics, camera.distortion, height, width)
 
 
 def _resized(

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from twofold.capture.layout import intrinsics_faults
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
+from twofold.geometry.lens import largest_distortion
 from twofold.prepare.cameras.calibration import (
     CalibratedCamera,
     for_pictures,
-    largest_distortion,
     match_cameras,
     pinhole,
     size_of_principal_point,
@@ -219,7 +219,7 @@ def open_clips(clips: Sequence[Path], config: PrepareConfig) -> list[Clip]:
             continue
         lens = for_pictures(lenses[k], next(iter(Frames(clip, config.fps))).image)
         small = _smaller(lens, info)
-        straight = largest_distortion(small, info.height, info.width) <= _LENS_MATTERS
+        straight = largest_distortion(small.intrinsics, small.distortion, info.height, info.width) <= _LENS_MATTERS
         camera = small.without_distortion()
         seen = pinhole(camera, info.height, info.width)
         ready.append(Clip(name, clip, frames, info, seen, None if straight else small, camera))
