@@ -222,9 +222,8 @@ def write_hdf5(folder: Path, scene: Scene, kind: str = "vid2avatar", cut: int = 
             for name, array in {**hdf5_images(scene, shown, kind), **HDF5_KINDS[kind](scene, shown)}.items():
                 rows = name in ("images", "imgs", "masks", "masks_samp")
                 array = array if array.dtype.kind in "uS" else array.astype("f4" if array.dtype.kind == "f" else "i8")
-                file.create_dataset(
-                    name, data=array, chunks=(1, *array.shape[1:]) if rows else None, compression="gzip" if rows else None
-                )  # fmt: skip
+                packed = {"chunks": (1, *array.shape[1:]), "compression": "gzip"} if rows else {}
+                file.create_dataset(name, data=array, **packed)
     return folder / "377_training.h5"
 
 
@@ -292,7 +291,8 @@ def hdf5_npc(scene, shown):
         "c2ws": np.stack([np.linalg.inv(view) @ flip for _, _, view in found]),
         "focals": np.stack([scene.cameras[c][0][[0, 1], [0, 1]] for c, _ in shown]),
         "centers": np.stack([scene.cameras[c][0][:2, 2] for c, _ in shown]),
-        "skts": np.stack(skeletons), "kp3d": np.stack(points), "img_pose_indices": np.arange(n), "kp_idxs": np.arange(n),
+        "skts": np.stack(skeletons), "kp3d": np.stack(points), "img_pose_indices": np.arange(n),
+        "kp_idxs": np.arange(n),
         "bones": np.repeat(np.stack([pose[None, :3] for pose, _, _ in found]), 24, 1), "betas": np.zeros((0,)),
         "rest_pose": (scene.rest_joints - scene.joint).numpy(), "cyls": np.zeros((n, 5)),
     }  # fmt: skip

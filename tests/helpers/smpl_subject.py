@@ -1,4 +1,4 @@
-"""A person with an SMPL file of their own, seen by a ring of cameras: the ground truth that data sets are written of."""
+"""A person with an SMPL file of their own, seen by a ring of cameras: what data sets are written of."""
 
 import functools
 import math
@@ -101,9 +101,7 @@ class Scene:
         if self.shown is not None:
             return self.shown(index, frame)
         camera = self.camera(index)
-        camera = replace(
-            camera, world_to_camera=camera.world_to_camera.float(), intrinsics=camera.intrinsics.float()
-        )
+        camera = replace(camera, world_to_camera=camera.world_to_camera.float(), intrinsics=camera.intrinsics.float())
         hits = rasterize(camera, self.vertices(frame).float(), self.body.faces)
         corners = self.body.faces[hits.face]
         place = (self.body.template[corners] * hits.barycentric[..., None]).sum(1)
@@ -180,8 +178,8 @@ def scene_of(capture: Capture, folder: Path) -> Scene:
     """A scene of a capture (of the studio): its body as an SMPL file of one shape, its images as they are."""
     shaped = shape_body(capture.body, capture.betas)
     plain = replace(
-        capture.body, template=shaped.vertices, joints=shaped.joints, shape_basis=torch.zeros(len(shaped.vertices), 3, 0),
-        joint_basis=torch.zeros(24, 3, 0),
+        capture.body, template=shaped.vertices, joints=shaped.joints,
+        shape_basis=torch.zeros(len(shaped.vertices), 3, 0), joint_basis=torch.zeros(24, 3, 0),
     )  # fmt: skip
     arrays = smpl_arrays(plain)
     arrays["posedirs"] = (
@@ -190,7 +188,7 @@ def scene_of(capture: Capture, folder: Path) -> Scene:
         else np.zeros_like(arrays["posedirs"])
     )
     np.savez(folder / "smpl.npz", **arrays)
-    frames = {(f.camera_name, f.time): f for split in capture.splits.values() for f in split}
+    frames = {(f.camera_name, f.frame_index): f for split in capture.splits.values() for f in split}
     names = sorted({name for name, _ in frames})
     times = sorted({time for _, time in frames})
     by_time = {time: next(f for (_, t), f in frames.items() if t == time) for time in times}

@@ -39,7 +39,7 @@ def require_run(path: Path) -> None:
 
 
 def require_fitted(path: Path) -> None:
-    """Refuses folders of other programs that `twofold import` cannot read, and says how their images can be used.
+    """Refuses folders of other programs that `twofold convert` cannot read, and says how their images can be used.
 
     Raises:
         TwofoldError: says what it is and which command takes it.
@@ -48,14 +48,13 @@ def require_fitted(path: Path) -> None:
         return
     if all(is_there(path / name) for name in ("cameras.pkl", "mesh_infos.pkl")):
         raise TwofoldError(
-            f"{shown_path(path)} is a HumanNeRF folder, whose cameras and poses are pickles, which may run code and "
-            f"are never opened; give its images and masks to twofold prepare {path}/images --masks {path}/masks --out "
-            "CAPTURE"
+            f"{shown_path(path)} is a HumanNeRF folder without {path}/images; get its images, or make a capture of a "
+            "video of your own: twofold prepare VIDEO --out CAPTURE"
         )
     if any(is_there(path / name) for name in ("wham_output.pkl", "slam_results.pth")):
         raise TwofoldError(
-            f"{shown_path(path)} is output of WHAM, a pickle, which may run code and is never opened; give the video "
-            "to twofold prepare VIDEO --out CAPTURE, with the poses saved as npz (--poses) if you want to keep them."
+            f"{shown_path(path)} is output of WHAM, which has no images; give the video with the poses: "
+            f"twofold prepare VIDEO --poses {path}/wham_output.pkl --body SMPL_FILE --out CAPTURE"
         )
     what = _other_than_capture(path)
     if what and "twofold prepare" in what:
@@ -80,7 +79,7 @@ def _other_than_capture(path: Path) -> str | None:
     if is_there(path / "recipe.json"):
         return "a run, expected a capture folder; name the capture that it was trained on, or another one."
     if is_there(path / "capture.npz"):
-        return f"not yet a capture folder; make one of it: twofold import {path} {path.name}-capture"
+        return f"not yet a capture folder; make one of it: twofold convert {path} {path.name}-capture"
     try:
         endings = {entry.suffix.lower() for entry in path.iterdir()}
     except OSError:

@@ -1,4 +1,4 @@
-"""Commands that make captures and check them: `twofold studio`, `import`, `prepare`, `check`."""
+"""Commands that make captures and check them: `twofold studio`, `prepare`, `check`."""
 
 import sys
 from pathlib import Path
@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from twofold.cli.advice import require_capture, require_fitted
 from twofold.cli.console import bar, console, say, within
+from twofold.cli.datasets import SplitName, capture_from
 
 
 def studio(
@@ -38,38 +38,6 @@ def studio(
     with bar("Filming") as progress:
         make_studio(config, out, lambda done: progress(done, ""))
     say(f"The capture is in {out}.", f"twofold train {out}")
-
-
-def import_capture(
-    source: Annotated[Path, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.Positional],
-    held_out: int = 10,
-    drop_below_iou: float = 0.0,
-    held_objects: Literal["keep", "remove"] = "remove",
-    fps: float | None = None,
-    credit: str = "",
-) -> None:
-    """Make a capture folder from one that was prepared elsewhere (images, masks, capture.npz).
-
-    Args:
-        source: Folder with images/, masks/ and capture.npz.
-        out: Folder to make.
-        held_out: Every Nth frame is held out for testing.
-        drop_below_iou: Leaves out frames whose fitted body covers the mask worse than this, 0 to 1.
-        held_objects: Whether a ball or the like that moves apart from the body is taken out of the masks.
-        fps: Frames a second; by default what capture.npz says, else 30.
-        credit: Whom to name when showing the images.
-    """
-    from twofold.prepare.import_fitted import import_prepared
-
-    require_fitted(source)
-    remarks: list[str] = []
-    import_prepared(
-        source, out, held_out, drop_below_iou, held_objects=held_objects, fps=fps, credit=credit, remark=remarks.append
-    )
-    for sentence in remarks:
-        console().print(f"Note: {sentence}", soft_wrap=True)
-    say(f"The capture is in {out}.", f"twofold check {out}")
 
 
 def prepare(
@@ -135,14 +103,18 @@ def check(
     out: Path | None = None,
     max_images: int = 100,
     write_splits: bool = False,
+    body: Path | None = None,
+    split: SplitName | None = None,
 ) -> None:
     """Check whether a capture is worth training on, and report what to fix; exit code 1 where it is not trainable.
 
     Args:
-        capture: Capture folder.
+        capture: Capture folder, or a data set that `twofold convert` knows; captures/NAME is made of that first.
         out: Folder for the report and its metrics; by default CAPTURE/check.
         max_images: Images to check, evenly spread.
         write_splits: Whether images that findings advise to leave out are taken out of the capture's splits.
+        body: Your own SMPL file, for a data set.
+        split: Whose training and test images, for a data set.
     """
     from twofold.capture.splits import leave_out
     from twofold.check.check_report import require_no_file, write_check
@@ -151,7 +123,7 @@ def check(
     from twofold.check.rules import judge
 
     within(max_images=(max_images, 2, None))
-    require_capture(capture)
+    capture = capture_from(capture, body, split)
     require_no_file(out or capture / "check")
     with bar("Checking") as progress:
         facts, read = measure_capture(capture, max_images, lambda done: progress(0.9 * done, ""))

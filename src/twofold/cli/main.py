@@ -17,8 +17,9 @@ import tyro
 
 from twofold import __version__
 from twofold.cli.advice import after_evaluation, after_rendering, require_capture, require_run
-from twofold.cli.captures import check, import_capture, prepare, studio
+from twofold.cli.captures import check, prepare, studio
 from twofold.cli.console import ALONE, bar, console, say, within
+from twofold.cli.datasets import SplitName, capture_from, convert
 from twofold.cli.exports import export
 from twofold.cli.motions import NO_MOTION, MotionView, motion, render_by_mesh, render_motion
 from twofold.cli.protocol_table import networks_asked_for, print_protocols
@@ -43,11 +44,14 @@ def train(
     device: str = "auto",
     resume: Path | None = None,
     settings: bool = False,
+    body: Path | None = None,
+    split: SplitName | None = None,
 ) -> None:
     """Train an avatar from a capture folder.
 
     Args:
-        capture: Capture folder (`twofold prepare`, `twofold studio`, `twofold import`).
+        capture: Capture folder (`twofold prepare`, `twofold studio`, `twofold convert`), or a data set that
+            `twofold convert` knows; captures/NAME is made of that first.
         out: Run folder to make; by default runs/NAME-RECIPE.
         recipe: quick (minutes on a CPU), fast (the released networks, sampled near the body), released, paper.
         set: Settings, such as training.steps=500; one or several, once or several times.
@@ -55,6 +59,8 @@ def train(
         device: auto, cpu, cuda or cuda:N.
         resume: Run folder of an interrupted training to continue.
         settings: Shows every setting that --set can change, as the recipe has it, and does nothing else.
+        body: Your own SMPL file, for a data set.
+        split: Whose training and test images, for a data set.
     """
     if settings:
         _show_settings(recipe, set, seed)
@@ -67,10 +73,11 @@ def train(
     from twofold.training.run import RECIPE, choose_device, find_capture, read_recipe
 
     if resume is None:
-        chosen, folder, source = _new_run(capture, out, recipe, set, seed)
-    elif set or out or seed or recipe != "quick":
+        chosen, folder, source = _new_run(capture, out, recipe, set, seed, body, split)
+    elif set or out or seed or recipe != "quick" or body or split:
         raise TwofoldError(
-            "--resume continues a run as it was begun; leave --set, --out, --seed and --recipe out, or start a new run."
+            "--resume continues a run as it was begun; leave --set, --out, --seed, --recipe, --body and --split out, "
+            "or start a new run."
         )
     else:
         require_run(resume)
@@ -114,7 +121,13 @@ def _show_settings(recipe: str, overrides: tuple[str, ...], seed: int) -> None:
 
 
 def _new_run(
-    capture: Path | None, out: Path | None, recipe: str, overrides: tuple[str, ...], seed: int
+    capture: Path | None,
+    out: Path | None,
+    recipe: str,
+    overrides: tuple[str, ...],
+    seed: int,
+    body: Path | None,
+    split: SplitName | None,
 ) -> "tuple[Recipe, Path, Path]":
     """Recipe, folder and capture of a run to begin."""
     from twofold.methods.table import RECIPES, with_settings
@@ -122,10 +135,13 @@ def _new_run(
 
     if capture is None:
         raise TwofoldError("Expected a capture folder (`twofold train CAPTURE`) or --resume RUN; neither was given.")
-    require_capture(capture)
+    settings = with_settings(RECIPES[recipe](), [f"seed={seed}", *overrides])
+    if out is not None:
+        require_free(out)
+    capture = capture_from(capture, body, split)
     folder = out or Path("runs") / f"{capture.resolve().name}-{recipe}"
     require_free(folder)
-    return with_settings(RECIPES[recipe](), [f"seed={seed}", *overrides]), folder, capture
+    return settings, folder, capture
 
 
 def _attach_perceptual(avatar: "Avatar") -> str | None:
@@ -266,7 +282,7 @@ def demo(out: Path = Path("demo"), seed: int = 0) -> None:
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "studio": studio,
-    "import": import_capture,
+    "convert": convert,
     "prepare": prepare,
     "check": check,
     "train": train,
@@ -297,6 +313,9 @@ def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
 
     return chosen
 
+
+ALIASES = {"import": "convert"}
+"""Commands that had another name; the old one still works."""
 
 RENAMED = {
     "check": {"--most": "--max-images"},
@@ -345,7 +364,7 @@ def _run(words: list[str]) -> None:
             _offer_recipes()
         command = tyro.extras.subcommand_cli_from_dict(
             {name: _later(command) for name, command in COMMANDS.items()}, prog="twofold",
-            args=_one_by_one(_renamed(words)),
+            args=_one_by_one(_renamed([ALIASES.get(word, word) for word in words[:1]] + words[1:])),
             description="A video of a person goes in, an avatar comes out. --version prints the version.",
             config=(tyro.conf.AvoidSubcommands,),
         )  # fmt: skip

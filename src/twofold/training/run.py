@@ -16,6 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from twofold import __version__
+from twofold.capture.layout import DESCRIPTION
 from twofold.capture.types import Capture
 from twofold.config import to_dict
 from twofold.errors import TwofoldError
@@ -100,6 +101,7 @@ def start_folder(folder: Path, recipe: Recipe, subject: Subject, capture: Path, 
         "threads": torch.get_num_threads(),
         "packages": packages,
         "capture": str(capture.resolve()),
+        **_body_file(capture),
         "notes": list(notes),
     }
 
@@ -118,6 +120,15 @@ def start_folder(folder: Path, recipe: Recipe, subject: Subject, capture: Path, 
     else:
         with new_folder(folder) as place:
             fill(place)
+
+
+def _body_file(capture: Path) -> dict[str, object]:
+    """Name and SHA-256 of the user's SMPL file that a converted capture was made with; nothing where there is none."""
+    file = capture / DESCRIPTION
+    description = read_json(file) if is_there(file) else None
+    notes = description.get("notes") if isinstance(description, dict) else None
+    kept = ("body_file", "body_sha256")
+    return {key: notes[key] for key in kept if notes.get(key)} if isinstance(notes, dict) else {}
 
 
 def read_recipe(folder: Path) -> Recipe:

@@ -15,7 +15,6 @@ from twofold.geometry.cameras import project
 from twofold.prepare.cameras.calibration import (
     distort,
     for_pictures,
-
     match_cameras,
     pinhole,
     undistort,

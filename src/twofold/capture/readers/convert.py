@@ -13,8 +13,9 @@ from twofold.body.skeleton import Body
 from twofold.body.smpl import read_smpl
 from twofold.capture.folder import CaptureWriter
 from twofold.capture.layout import spans
-from twofold.capture.readers.images import Converter, agreement
-from twofold.capture.readers.protocols import (
+from twofold.capture.readers.formats import READERS, Reader, reader_of
+from twofold.capture.readers.image_converter import ImageConverter, agreement
+from twofold.capture.readers.published_splits import (
     ProtocolName,
     count_images,
     default_protocol,
@@ -23,9 +24,8 @@ from twofold.capture.readers.protocols import (
     split,
 )
 from twofold.capture.readers.sequence import MaskChoice, ReadOptions, Sequence3D, Split
-from twofold.capture.readers.table import READERS, Reader, reader_of
 from twofold.capture.readers.world import posed_joints, upright
-from twofold.capture.readers.zju import subject_of
+from twofold.capture.readers.zju_raw import subject_of
 from twofold.capture.types import SPLITS, spread
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
@@ -89,7 +89,7 @@ def convert(
     out: Path,
     options: ConvertOptions | None = None,
     overwrite: bool = False,
-    show: Callable[[float, str], None] = lambda done, what: None,
+    progress: Callable[[float, str], None] = lambda done, what: None,
     remark: Callable[[str], None] = lambda sentence: None,
 ) -> Converted:
     """Makes a capture folder from a foreign data set.
@@ -99,7 +99,7 @@ def convert(
         out: the capture folder to make.
         options: see there.
         overwrite: a capture that lies at `out` is overwritten.
-        show: called with the share that is done and what is being done.
+        progress: called with the share that is done and what is being done.
         remark: called with each sentence that the user should know.
 
     Raises:
@@ -111,7 +111,7 @@ def convert(
     reader = _require_reader(source)
     body = read_user_body(options.body, reader.title)
     with CaptureWriter(out, overwrite) as writer:
-        show(0.0, "reading cameras and poses")
+        progress(0.0, "reading cameras and poses")
         sequence, protocol = _read(reader, source, body, options)
         for sentence in sequence.remarks:
             remark(sentence)
@@ -124,11 +124,11 @@ def convert(
         joints = posed_joints(body, sequence.betas, poses, translations)
         shown = {camera for camera, _ in ordered(chosen)}
         converters = {
-            name: Converter(camera, _first(sequence, chosen, name), options.scale, joints)
+            name: ImageConverter(camera, _first(sequence, chosen, name), options.scale, joints)
             for name, camera in cameras.items() if name in shown
         }  # fmt: skip
         remark(_verify(sequence, chosen, converters, body, poses, translations))
-        lost = _write_images(writer, sequence, chosen, converters, show)
+        lost = _write_images(writer, sequence, chosen, converters, progress)
         if lost:
             remark(_about_lost(lost))
         kept = without(chosen, lost)
@@ -141,7 +141,7 @@ def convert(
             translations=translations.float(), cameras=fitting, splits=kept, fps=options.fps or USUAL_FPS,
             credit=options.credit, notes=_notes(source, sequence, protocol, options, lost),
         )  # fmt: skip
-    show(1.0, "done")
+    progress(1.0, "done")
     return Converted(out, count_images(kept))
 
 
@@ -230,7 +230,7 @@ def _first(sequence: Sequence3D, chosen: Split, camera: str) -> tuple[int, int]:
 def _verify(
     sequence: Sequence3D,
     chosen: Split,
-    converters: Mapping[str, Converter],
+    converters: Mapping[str, ImageConverter],
     body: Body,
     poses: torch.Tensor,
     translations: torch.Tensor,
@@ -260,8 +260,8 @@ def _write_images(
     writer: CaptureWriter,
     sequence: Sequence3D,
     chosen: Split,
-    converters: Mapping[str, Converter],
-    show: Callable[[float, str], None],
+    converters: Mapping[str, ImageConverter],
+    progress: Callable[[float, str], None],
 ) -> dict[tuple[str, int], str]:
     """Writes every image that a split shows; returns those that are unfit, with the reason."""
     images = ordered(chosen)
@@ -281,7 +281,7 @@ def _write_images(
         for done, (key, fault) in enumerate(zip(images, pool.map(write, images), strict=True), 1):
             if fault:
                 lost[key] = fault
-            show(0.05 + 0.93 * done / len(images), f"{done} of {len(images)} images")
+            progress(0.05 + 0.93 * done / len(images), f"{done} of {len(images)} images")
     return lost
 
 

@@ -15,7 +15,7 @@ from twofold.capture.readers.hdf5_files import has_all, opened_hdf5, require_row
 from twofold.capture.readers.placement import as_rows, from_pelvis
 from twofold.capture.readers.sequence import SourceCamera, camera_of, numbers, require_radians
 from twofold.capture.readers.shape_fit import fit_betas, require_joints
-from twofold.capture.readers.vid2avatar import split_projection
+from twofold.capture.readers.vid2avatar_folder import split_projection
 from twofold.capture.readers.zju_files import require_shapes, root_joint
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import matrix_to_axis_angle
@@ -176,14 +176,14 @@ KINDS: dict[str, tuple[tuple[str, ...], Callable[[Any, Path, Body, list[str]], _
 
 
 def _inverse(matrix: Float[np.ndarray, "4 4"], what: str, path: Path) -> Float[np.ndarray, "4 4"]:
-    rotation = matrix[:3, :3]
+    rotation: Float[np.ndarray, "3 3"] = matrix[:3, :3]
     off = np.subtract(rotation @ rotation.T, np.eye(3))
     if np.abs(off).max() > 1e-2 or np.linalg.det(rotation) < 0:
         raise TwofoldError(f"{what} in {path} is no rigid transform; get the file again.")
     u, _, v = np.linalg.svd(rotation)
     inverse = np.eye(4)
     inverse[:3, :3] = (u @ v).T
-    inverse[:3, 3] = -(u @ v).T @ matrix[:3, 3]
+    inverse[:3, 3] = np.negative(inverse[:3, :3] @ matrix[:3, 3])
     return inverse
 
 

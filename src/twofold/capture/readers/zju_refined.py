@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from twofold.capture.readers.sequence import ReadOptions, Sequence3D, SourceCamera, SourceImage, image_from_files
-from twofold.capture.readers.zju import subject_of
 from twofold.capture.readers.zju_files import ANNOTATIONS, read_annotations, read_parameters
+from twofold.capture.readers.zju_raw import subject_of
 from twofold.errors import TwofoldError
 from twofold.inputs import is_there
 

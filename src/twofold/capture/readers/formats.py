@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from twofold.capture.readers import hdf5, humannerf, vid2avatar, zju, zju_refined
+from twofold.capture.readers import hdf5_sequence, humannerf_folder, vid2avatar_folder, zju_raw, zju_refined
 from twofold.capture.readers.sequence import ReadOptions, Sequence3D
 
 
@@ -25,10 +25,10 @@ class Reader:
 
 READERS: dict[str, Reader] = {
     "zju_refined": Reader("refined ZJU-MoCap", zju_refined.recognizes, zju_refined.read),
-    "zju": Reader("ZJU-MoCap", zju.recognizes, zju.read),
-    "humannerf": Reader("a folder of HumanNeRF or MonoHuman", humannerf.recognizes, humannerf.read),
-    "vid2avatar": Reader("a folder of Vid2Avatar", vid2avatar.recognizes, vid2avatar.read),
-    "hdf5": Reader("HDF5 files of the paper's pipeline", hdf5.recognizes, hdf5.read),
+    "zju": Reader("ZJU-MoCap", zju_raw.recognizes, zju_raw.read),
+    "humannerf": Reader("a folder of HumanNeRF or MonoHuman", humannerf_folder.recognizes, humannerf_folder.read),
+    "vid2avatar": Reader("a folder of Vid2Avatar", vid2avatar_folder.recognizes, vid2avatar_folder.read),
+    "hdf5": Reader("HDF5 files of the paper's pipeline", hdf5_sequence.recognizes, hdf5_sequence.read),
 }
 """In the order in which they are asked."""
 

@@ -31,8 +31,8 @@ from twofold.capture.readers.sequence import (
     same_camera,
 )
 from twofold.capture.readers.shape_fit import fit_betas, require_joints
-from twofold.capture.readers.zju import subject_of
 from twofold.capture.readers.zju_files import require_shapes, root_joint
+from twofold.capture.readers.zju_raw import subject_of
 from twofold.errors import TwofoldError
 from twofold.inputs import is_there, read_json
 from twofold.pickles import as_dict, read_pickle

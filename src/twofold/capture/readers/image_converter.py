@@ -23,7 +23,7 @@ _PERSON = 128
 
 
 @final
-class Converter:
+class ImageConverter:
     """Brings the images of one camera to what a capture holds.
 
     Args:

@@ -18,8 +18,8 @@ from torch import Tensor
 from twofold.capture.readers.hdf5_files import image_row, is_hdf5
 from twofold.capture.readers.hdf5_kinds import Part, read_part
 from twofold.capture.readers.sequence import ReadOptions, Sequence3D, SourceCamera, SourceImage, at_rest
-from twofold.capture.readers.zju import subject_of
 from twofold.capture.readers.zju_files import root_joint
+from twofold.capture.readers.zju_raw import subject_of
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigid_transform
 
