@@ -10,7 +10,7 @@ from PIL import Image
 from smpl_subject import LENS, Z_DOWN, Scene
 
 from twofold.body.skeleton import joint_transforms
-from twofold.capture.readers.placement import to_model_origin, to_pelvis
+from twofold.capture.readers.body_placement import to_model_origin, to_pelvis
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 
 FLIP = np.diag([1.0, -1.0, -1.0])

@@ -14,7 +14,7 @@ from tiny_person import person_body
 
 from twofold.body.skeleton import PARENTS, Body, pose_body, shape_body
 from twofold.body.smpl import read_smpl
-from twofold.capture.readers.placement import moved_world
+from twofold.capture.readers.body_placement import moved_world
 from twofold.capture.types import Capture
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.lens import pixel_places, resampler, undistorted_pixels

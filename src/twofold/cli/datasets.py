@@ -51,7 +51,7 @@ def convert(
         credit: Whom to name when showing the images.
     """
     from twofold.capture.readers.convert import ConvertOptions
-    from twofold.capture.readers.formats import reader_of
+    from twofold.capture.readers.known_formats import reader_of
 
     if is_there(source / "capture.npz") or reader_of(source) is None:
         if body is not None or split is not None or scale != 1.0 or masks is not None:
@@ -119,7 +119,7 @@ def capture_from(path: Path, body: Path | None, split: SplitName | None) -> Path
             lies where the capture would be.
     """
     from twofold.capture.readers.convert import ConvertOptions
-    from twofold.capture.readers.formats import reader_of
+    from twofold.capture.readers.known_formats import reader_of
 
     reader = None if is_there(path / "capture.json") else reader_of(path)
     if reader is None:

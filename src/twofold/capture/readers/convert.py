@@ -13,8 +13,8 @@ from twofold.body.skeleton import Body
 from twofold.body.smpl import read_smpl
 from twofold.capture.folder import CaptureWriter
 from twofold.capture.layout import spans
-from twofold.capture.readers.formats import READERS, Reader, reader_of
 from twofold.capture.readers.image_converter import ImageConverter, agreement
+from twofold.capture.readers.known_formats import READERS, Reader, reader_of
 from twofold.capture.readers.published_splits import (
     ProtocolName,
     count_images,

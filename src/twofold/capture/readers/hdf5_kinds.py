@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.skeleton import PARENTS, Body, joint_transforms
+from twofold.capture.readers.body_placement import as_rows, from_pelvis
 from twofold.capture.readers.hdf5_files import has_all, opened_hdf5, require_rows, small_array
-from twofold.capture.readers.placement import as_rows, from_pelvis
 from twofold.capture.readers.sequence import SourceCamera, camera_of, numbers, require_radians
 from twofold.capture.readers.shape_fit import fit_betas, require_joints
 from twofold.capture.readers.vid2avatar_folder import split_projection

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.skeleton import Body
-from twofold.capture.readers.placement import as_rows, from_model_origin, from_pelvis
+from twofold.capture.readers.body_placement import as_rows, from_model_origin, from_pelvis
 from twofold.capture.readers.sequence import (
     ReadOptions,
     Sequence3D,

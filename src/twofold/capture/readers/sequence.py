@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from twofold.body.skeleton import Body
-from twofold.capture.readers.placement import moved_world
+from twofold.capture.readers.body_placement import moved_world
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import rigid_inverse
 from twofold.images import read_grey, read_rgb

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from scipy.linalg import rq
 
-from twofold.capture.readers.placement import as_rows
+from twofold.capture.readers.body_placement import as_rows
 from twofold.capture.readers.sequence import (
     ReadOptions,
     Sequence3D,

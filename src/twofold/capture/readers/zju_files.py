@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.skeleton import Body, pose_body, shape_body
-from twofold.capture.readers.placement import as_rows, from_model_origin
+from twofold.capture.readers.body_placement import as_rows, from_model_origin
 from twofold.capture.readers.sequence import SourceCamera, camera_of, mean_betas, numbers, require_radians
 from twofold.errors import TwofoldError
 from twofold.inputs import is_there

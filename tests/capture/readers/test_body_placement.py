@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from twofold.capture.readers.placement import (
+from twofold.capture.readers.body_placement import (
     as_rows,
     from_model_origin,
     from_pelvis,

@@ -8,7 +8,7 @@ from smpl_subject import make_scene, write_smpl
 
 from twofold.capture.folder import read_capture
 from twofold.capture.readers.convert import ConvertOptions, convert
-from twofold.capture.readers.formats import READERS, reader_of
+from twofold.capture.readers.known_formats import READERS, reader_of
 from twofold.capture.readers.sequence import ReadOptions
 from twofold.errors import TwofoldError
 
