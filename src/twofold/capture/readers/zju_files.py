@@ -25,7 +25,7 @@ _MAX_OPCODES = 10_000_000
 """Of `annots.npy`: the longest recording names 50,000 images."""
 _MAX_FRAMES = 100_000
 _MILLIMETRES = 50.0
-"""Translations beyond it are millimetres: no camera stands so many metres away, and none so near."""
+"""Translations beyond it are millimetres; a camera 50 metres away, or 5 centimetres from the origin, does not occur."""
 _SAME_SURFACE = 0.005
 """Metres: vertices made by the same model agree to a tenth of it."""
 _ANNOTATIONS_WORDS = "ZJU-MoCap's annotations"
