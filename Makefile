@@ -26,7 +26,7 @@ test-all: checks ## The same, with the tests that take minutes
 	$(BIN)/python -m pytest -m "" $(PYTEST_ARGS)
 	$(MAKE) docs
 
-checks: $(VENV)/.ready-all ## Style, spelling, floors, types
+checks: $(VENV)/.ready-all ## Style, spelling, layers, types
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/codespell

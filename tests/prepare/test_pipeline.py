@@ -153,8 +153,8 @@ def test_bad_frames_are_left_out_and_listed(tmp_path, monkeypatch):
     assert splits["novel_pose"]["cam0"] == [kept[5], kept[15]]
     assert splits["train"]["cam0"] == [t for t in kept if t not in (kept[5], kept[15])]
     rows = notes["quality"]
-    assert [row["time"] for row in rows] == list(range(24))
-    assert [row["time"] for row in rows if row["fault"]] == [7, 8, 12]
+    assert [row["frame_index"] for row in rows] == list(range(24))
+    assert [row["frame_index"] for row in rows if row["fault"]] == [7, 8, 12]
     assert rows[12]["reprojection"] is None
     assert rows[12]["fault"] == "nobody was found"
     assert "does not cover the mask" in rows[7]["fault"]

@@ -58,6 +58,7 @@ def prepare(
     person: Literal["largest", "masks"] | int | None = None,
     drop: str | None = None,
     credit: str = "",
+    refine_masks: Literal["auto", "off"] = "auto",
 ) -> None:
     """Make a capture folder from a video of one person, or from several synchronised ones.
 
@@ -80,6 +81,7 @@ def prepare(
             one in your own masks; by default the one in your own masks, landmarks or poses.
         drop: Frames to leave out of the splits, such as 3,7-9.
         credit: Whom to name when showing the images.
+        refine_masks: auto sharpens the estimator's masks by the background where the camera stands still.
     """
     from twofold.prepare.detect.blazepose import mediapipe_estimator
     from twofold.prepare.detect.people import count_people
@@ -89,7 +91,7 @@ def prepare(
 
     config = PrepareConfig(
         fps, max_size, read_intrinsics(intrinsics), calibration, train_camera, held_out, held_objects, credit,
-        masks, landmarks, poses, several_people, person, read_frames(drop),
+        masks, landmarks, poses, several_people, person, read_frames(drop), refine_masks,
     )  # fmt: skip
     with bar("Preparing") as progress:
         prepared = make(videos, out, read_body(body), mediapipe_estimator, config, progress, count_people)

@@ -2,6 +2,9 @@
 
 A z-buffer over all triangles at once. Meshes of a person have triangles about as small as a pixel, and for those a list
 of (triangle, pixel) pairs is far quicker than building a tree for ray casting anew in every pose.
+
+This is the reference: silhouettes, ground-truth images and every measurement come from it. The only other rasterizer,
+`outputs.raster_kernels`, is held against it.
 """
 
 from dataclasses import dataclass

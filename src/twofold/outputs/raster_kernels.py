@@ -1,4 +1,9 @@
-"""Compiled loops that draw a mesh: nearest triangle behind every sample, and its colour."""
+"""Compiled loops that render a mesh: nearest triangle behind every sample, and its colour.
+
+A second rasterizer beside the reference, `geometry.raster`, because previews and the viewer need some 25 images of a
+character of 40,000 triangles a second: `geometry.raster` lists every (triangle, pixel) pair in tensors and takes over
+ten times as long. It renders images only; nothing is measured with it.
+"""
 
 # pyright: reportMissingParameterType=false
 

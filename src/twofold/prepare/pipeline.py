@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -22,8 +23,9 @@ from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.prepare.cameras.calibration import pinhole, undistorter
 from twofold.prepare.cameras.triangulation import triangulate, turn_cameras
 from twofold.prepare.detect.left_right import repair_swaps, repair_with_views
+from twofold.prepare.detect.mask_refinement import refine_clip
 from twofold.prepare.detect.people import People, people_finder
-from twofold.prepare.detect.scan import Watched, watch_clip, with_masks
+from twofold.prepare.detect.scan import Watched, save_picture, watch_clip, with_masks
 from twofold.prepare.detections import Estimator, Track
 from twofold.prepare.fitting.fit import fit
 from twofold.prepare.fitting.observations import Evidence
@@ -58,6 +60,7 @@ class Prepared:
         qualities: a record of every image.
         warnings: sentences for the user.
         objects: share of the mask that held objects took, of each image that has some and is kept.
+        refined: share of the masks' pixels that refinement changed, of each clip whose masks were refined.
     """
 
     folder: Path
@@ -65,6 +68,7 @@ class Prepared:
     qualities: tuple[ImageQuality, ...]
     warnings: tuple[str, ...]
     objects: tuple[float, ...] = ()
+    refined: tuple[float, ...] = ()
 
     def summary(self) -> str:
         """What came of it in a few words."""
@@ -72,7 +76,16 @@ class Prepared:
         return (
             f"{len(self.kept)} of {moments} frames, silhouette IoU {self.mean('iou'):.2f}, landmarks off by "
             f"{self.mean('reprojection'):.1f} pixels ({self.mean('reprojection_percent'):.1f} % of the body's height)."
-            f"{self._objects()}"
+            f"{self._refined()}{self._objects()}"
+        )
+
+    def _refined(self) -> str:
+        """How much the masks were changed."""
+        if not self.refined:
+            return ""
+        return (
+            f" The masks were compared with the background, and {100 * np.mean(self.refined):.1f} % of their pixels "
+            "changed (--refine-masks off leaves them)."
         )
 
     def _objects(self) -> str:
@@ -185,7 +198,7 @@ def _watch_all(
                 seen = watch_clip(
                     clip.frames, clip.info.frames, found, scratch / clip.name, undistort,
                     [] if own.masks is None else own.masks.readings(),
-                    lambda done, k=k: progress(0.3 * (k + done) / len(ready), "looking at the images"), region,
+                    lambda done, k=k: progress((0.25 * done + 0.3 * k) / len(ready), "looking at the images"), region,
                 )  # fmt: skip
         finally:
             found.close()
@@ -196,6 +209,12 @@ def _watch_all(
         remarks += [f"{clip.name}: {remark}" for remark in clip.frames.remarks]
         if seen.repeated:
             remarks.append(f"{clip.name}: {seen.repeated} images equal the one before them and are left out.")
+        if config.refine_masks == "auto" and own.masks is None and seen.moved == 0:
+            changed = refine_clip(
+                seen.images, seen.masks, partial(save_picture, compress_level=1),
+                lambda done, k=k: progress((0.25 + 0.05 * done + 0.3 * k) / len(ready), "refining the masks"),
+            )  # fmt: skip
+            seen = replace(seen, refined=changed)
         require_length(len(seen.images), str(clip.path))
         if config.landmarks is None:
             require_person(seen.track, str(clip.path))
@@ -345,6 +364,9 @@ def _write(
             "clip_picture": {name: list(seen.sources) for name, seen in zip(cameras, watched, strict=True)},
             "objects_ignored": {n: sorted(a.ignored) for n, a in zip(cameras, agreed, strict=True)},
             "objects_share_of_mask": {n: {str(t): round(s, 4) for t, s in r.items()} for n, r in objects.items()},
+            "masks_refined_share": {
+                n: s.refined for n, s in zip(cameras, watched, strict=True) if s.refined is not None
+            },
             "seconds": [round(second, 4) for second in watched[0].seconds],
             "yaw_degrees": round(yaw, 1),
             "background_moves_pixels": None if moved is None else round(moved, 1),
@@ -353,7 +375,8 @@ def _write(
         },
     )
     shares = [share for removed in objects.values() for time, share in removed.items() if time in set(kept)]
-    return Prepared(out, tuple(kept), tuple(qualities), tuple(warnings), tuple(shares))
+    refined = tuple(seen.refined for seen in watched if seen.refined is not None)
+    return Prepared(out, tuple(kept), tuple(qualities), tuple(warnings), tuple(shares), refined)
 
 
 def _upright(found: _Found, body: Body) -> tuple[Tensor, Tensor, Mapping[str, Camera]]:

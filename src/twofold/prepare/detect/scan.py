@@ -47,6 +47,7 @@ class Watched:
         repeated: images that show the same as the one before, and are left out.
         overlaps: of each reading of the user's own masks the IoU with the estimator's, NaN where one is missing; empty
             unless there are several readings.
+        refined: share of the masks' pixels that comparing them with the background changed; None where it was not done.
     """
 
     images: tuple[Path, ...]
@@ -59,6 +60,7 @@ class Watched:
     sample: tuple[UInt8[np.ndarray, "h w 3"], ...]
     repeated: int = 0
     overlaps: tuple[tuple[float, ...], ...] = ()
+    refined: float | None = None
 
     def at(self, places: Sequence[int]) -> "Watched":
         """Only some of the images, by their places."""

@@ -57,6 +57,7 @@ class PrepareConfig:
         person: which of several people is meant; None for whom the user's own masks, landmarks or poses show, else for
             the only one.
         drop: frames that are left out of the splits.
+        refine_masks: "auto" compares the estimator's masks with the background where the camera stands still.
     """
 
     fps: float | None = None
@@ -73,6 +74,7 @@ class PrepareConfig:
     several_people: Literal["refuse", "ignore"] = "refuse"
     person: Choice | None = None
     drop: tuple[int, ...] = ()
+    refine_masks: Literal["auto", "off"] = "auto"
 
 
 _HINTS = {
