@@ -93,7 +93,8 @@ def report(
     if missing:
         tell(missing)
     size_mb = target.stat().st_size / 1e6
-    say(f"The page is {target} ({size_mb:.1f} MB, one file).", f"open it in a browser; or twofold export {run}")
+    following = f"twofold export {run}" if character else f"twofold render {run} --motion dance"
+    say(f"The page is {target} ({size_mb:.1f} MB, one file).", f"open it in a browser; or {following}")
 
 
 def _place(page: Path, target: Path) -> None:
