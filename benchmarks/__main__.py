@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 
-PARTS = ("step", "rendering", "quality")
+PARTS = ("step", "rendering", "quality", "evaluating")
 
 
 def main() -> None:

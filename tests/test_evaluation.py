@@ -1,5 +1,6 @@
 """What is measured, and what the file says about it."""
 
+import weakref
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -50,6 +51,25 @@ def test_what_is_ignored_spoils_no_figure_and_its_share_is_told(capture, monkeyp
     assert figures["ssim_box"] == pytest.approx(1)
     assert figures["protocol"]["ignored"].startswith("8.3 % of the box on average")
     assert "ignored" not in evaluate.measure_split(avatar, capture, "train")["protocol"]
+
+
+def test_one_rendering_at_a_time_is_in_memory(capture, monkeypatch):
+    alive: weakref.WeakSet[RenderedImage] = weakref.WeakSet()
+    most = []
+
+    def drawn(avatar, capture, frame, refined):
+        image, mask = frame.composited(torch.tensor(capture.background)), frame.mask()
+        rendered = RenderedImage(image, mask, depth=mask, normal=image, base=image, base_normal=image)
+        alive.add(rendered)
+        most.append(len(alive))
+        return rendered
+
+    monkeypatch.setattr(evaluate, "render_frame", drawn)
+    many = replace(capture, splits={**capture.splits, "novel_pose": capture.splits["novel_pose"] * 20})
+    evaluate.measure_split(refined_avatar(()), many, "novel_pose")
+    # The one before is forgotten when the next one takes its name.
+    assert len(most) == 40
+    assert max(most) <= 2
 
 
 def refined_avatar(parts):

@@ -20,6 +20,7 @@ from twofold.cli.advice import after_evaluation, after_rendering, require_captur
 from twofold.cli.captures import check, prepare, studio
 from twofold.cli.console import ALONE, bar, console, say, within
 from twofold.cli.datasets import SplitName, capture_from, convert
+from twofold.cli.experiments_command import reproduce
 from twofold.cli.exports import export
 from twofold.cli.motions import NO_MOTION, MotionView, motion, render_by_mesh, render_motion
 from twofold.cli.protocol_table import networks_asked_for, print_protocols
@@ -28,7 +29,6 @@ from twofold.cli.streams import streams_that_never_fail
 from twofold.errors import TwofoldError
 
 if TYPE_CHECKING:
-    from twofold.methods.base import Avatar
     from twofold.recipe import Recipe
     from twofold.training.loop import Progress
 
@@ -70,6 +70,7 @@ def train(
     from twofold.outputs.gallery import save_preview
     from twofold.training import loop
     from twofold.training.lock import require_unlocked
+    from twofold.training.perceptual_loss import attach_perceptual
     from twofold.training.run import RECIPE, choose_device, find_capture, read_recipe
 
     if resume is None:
@@ -93,7 +94,7 @@ def train(
             loop.train(
                 read, chosen, folder, where, resume is not None,
                 lambda p: progress(p.step / p.steps, _note(p)),
-                _attach_perceptual,
+                attach_perceptual,
                 lambda avatar, step: save_preview(avatar, read, folder, step),
                 lambda note: console().print(note, soft_wrap=True),
             )  # fmt: skip
@@ -142,17 +143,6 @@ def _new_run(
     folder = out or Path("runs") / f"{capture.resolve().name}-{recipe}"
     require_free(folder)
     return settings, folder, capture
-
-
-def _attach_perceptual(avatar: "Avatar") -> str | None:
-    """Gives the avatar its perceptual loss where its recipe has one; tells whether it has it."""
-    from twofold.metrics.perceptual import load_lpips, weights_hint
-
-    if not avatar.wants_perceptual:
-        return None
-    network = load_lpips()
-    avatar.attach_perceptual(network)
-    return weights_hint() if network is None else "LPIPS is part of the loss."
 
 
 def render(
@@ -290,6 +280,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "evaluate": evaluate,
     "motion": motion,
     "export": export,
+    "reproduce": reproduce,
     "report": report,
 }
 

@@ -189,22 +189,32 @@ ABLATIONS: dict[str, dict[str, object]] = {
 
 
 def ablation(name: str, start: Recipe) -> Recipe:
-    """One of the paper's ablations of a recipe: a name of `ABLATIONS`, or "[a]" or "[x,y]" for other frequency bands.
+    """One of the paper's ablations of a recipe.
+
+    Args:
+        name: one of `ABLATIONS`; or other frequencies. "[a]" is the pose-dependent branch alone and "[x,y]" are both
+            branches: of networks a number is the octaves of the encoding ("[5,10]"), of feature grids the finest
+            spacing ("[6cm,1cm]"), above which lies one level of twice that.
+        start: the recipe of the full model.
 
     Raises:
-        ValueError: there is no such ablation, or the recipe's field has no octaves to change.
+        ValueError: there is no such ablation, or the frequencies are named as the other kind of field has them.
     """
     losses, field = start.method.losses, start.method.field
-    bands = [int(band) for band in re.findall(r"\d+", name)] if re.fullmatch(r"\[\d+(, ?\d+)?\]", name) else []
-    if bands and isinstance(field, FactorizedFieldConfig):
-        if len(bands) == 1:
-            field = replace(field, branches="high", high_octaves=bands[0])
-        else:
-            field = replace(field, low_octaves=bands[0], high_octaves=bands[1])
-    elif name in ABLATIONS:
-        field = replace(field, **ABLATIONS[name])  # type: ignore[arg-type]
-    else:
-        raise ValueError(f"no ablation {name!r} of {start.name}; there are {', '.join(ABLATIONS)}, [a] and [x,y]")
+    changes: dict[str, object] = dict(ABLATIONS.get(name, {}))
+    unit = "" if isinstance(field, FactorizedFieldConfig) else "cm"
+    if re.fullmatch(rf"\[[\d.]+{unit}(, ?[\d.]+{unit})?\]", name):
+        frequencies = [float(number) for number in re.findall(r"[\d.]+", name)]
+        changes = {"branches": "high"} if len(frequencies) == 1 else {}
+        for branch, frequency in zip(("high", "low"), frequencies[::-1], strict=False):
+            if unit:
+                changes[f"{branch}_voxels"] = (0.02 * frequency, 0.01 * frequency)
+            else:
+                changes[f"{branch}_octaves"] = int(frequency)
+    elif name not in ABLATIONS:
+        bands = "[a] and [x,y] in octaves" if not unit else "[a] and [x,y] in centimetres, such as [6cm,1cm]"
+        raise ValueError(f"no ablation {name!r} of {start.name}; there are {', '.join(ABLATIONS)}, {bands}")
+    field = replace(field, **changes)
     if name in ("wo_s1c1", "wo_s2c2", "wo_common_loss", "wo_comm") or field.branches != "both":
         losses = replace(losses, common=0.0)
     return replace(start, name=f"{start.name} {name}", method=replace(start.method, field=field, losses=losses))

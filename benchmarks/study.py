@@ -1,0 +1,74 @@
+"""Collects finished cells of `twofold reproduce` into one stored result: every number by row, subject and seed.
+
+python -m benchmarks.study reproduce/tables/ablation-studio-quick.json [--name ablation]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common import store
+from twofold.reproduce.pose_distance import PROTOCOL, binned
+
+METRICS = {
+    "novel_view": ("psnr_box", "gradient_error"), "novel_pose": ("psnr_box", "gradient_error"),
+    "geometry": ("chamfer_cm",), "consistency": ("flow_error_mask_px",),
+}  # fmt: skip
+"""What is stored of a cell."""
+
+
+def collect(table: dict[str, Any], cells: Path) -> dict[str, Any]:
+    """Of each row every metric by "subject, seed N", the PSNR of novel poses by distance, and how it was trained.
+
+    Args:
+        table: JSON of a table.
+        cells: folder of the cells.
+    """
+    rows: dict[str, dict[str, dict[str, float]]] = {}
+    images: dict[str, list[dict[str, Any]]] = {}
+    steps: dict[str, int] = {}
+    for cell in table["cells"]:
+        if cell["state"] != "done":
+            continue
+        found = json.loads((cells / cell["key"] / "results.json").read_text("utf-8"))
+        steps[cell["row"]] = json.loads((cells / cell["key"] / "cell.json").read_text("utf-8"))["recipe"]["training"][
+            "steps"
+        ]
+        images.setdefault(cell["row"], []).extend(i for i in found["images"] if i["split"] == "novel_pose")
+        for section, names in METRICS.items():
+            for name in names:
+                value = found.get(section, {}).get(name)
+                if isinstance(value, float):
+                    where = f"{cell['subject']}, seed {cell['seed']}"
+                    rows.setdefault(cell["row"], {}).setdefault(f"{section}.{name}", {})[where] = value
+    distances = {
+        row: [list(point) for point in binned([i["pose_distance"] for i in own], [i["psnr_box"] for i in own])]
+        for row, own in images.items()
+    }
+    return {
+        "experiment": table["experiment"], "about": table["about"], "steps": steps, "rows": rows,
+        "extreme": {"protocol": f"PSNR over the box by {PROTOCOL}", "bins": distances},
+        "cells": [cell for cell in table["cells"] if cell["state"] == "done"],
+        "printed": {
+            line["row"]: {title: value["printed"] for title, value in line["values"].items() if value["printed"]}
+            for line in table["lines"]
+        },
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Collects and stores."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("table", type=Path)
+    parser.add_argument("--name", default="")
+    arguments = parser.parse_args()
+    table = json.loads(arguments.table.read_text("utf-8"))
+    name = arguments.name or table["experiment"]
+    store(f"study-{name}", collect(table, arguments.table.parent.parent / "cells"))
+
+
+if __name__ == "__main__":
+    main()

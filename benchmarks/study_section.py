@@ -1,0 +1,127 @@
+"""The part of `docs/results.md` that says whether the factorization is worth it, from stored studies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from twofold.reproduce.summary import Difference, compared
+
+FULL = ("Ours", "[6 cm, 1 cm] (full)", "[5, 10] (full)")
+"""What the full model is called."""
+COMPARED = (
+    ("novel_pose.psnr_box", "high", "Novel pose, dB", "pose PSNR"),
+    ("novel_view.psnr_box", "high", "Novel view, dB", "view PSNR"),
+    ("novel_pose.gradient_error", "low", "Novel pose, gradient error x 1000", ""),
+    ("geometry.chamfer_cm", "low", "Surface, mm", ""),
+)
+"""Metric, which way is better, what it is called, the paper's column."""
+SCALE = {"novel_pose.gradient_error": 1000.0, "geometry.chamfer_cm": 10.0}
+
+Table = Callable[[Sequence[str], Iterable[Sequence[str]]], str]
+
+
+def differences(study: Mapping[str, Any], metric: str, better: str) -> dict[str, Difference]:
+    """How much better the full model is than each other row, in pairs of equal subject and seed."""
+    rows = study["rows"]
+    full = next((rows[name] for name in FULL if name in rows), {})
+    found: dict[str, Difference] = {}
+    for row, numbers in rows.items():
+        if row in FULL or metric not in numbers or metric not in full:
+            continue
+        scale = SCALE.get(metric, 1.0)
+        pairs = [{(where, 0): scale * x for where, x in part[metric].items()} for part in (full, numbers)]
+        difference = compared(pairs[0], pairs[1], better)  # type: ignore[arg-type]
+        if difference is not None:
+            found[row] = difference
+    return found
+
+
+def answer(study: Mapping[str, Any]) -> str:
+    """The first paragraph: in which orderings the full model wins by more than the noise, and what follows."""
+    pose = differences(study, *COMPARED[0][:2])
+    view = differences(study, *COMPARED[1][:2])
+    pairs = min((d.pairs for d in pose.values()), default=0)
+    said = [
+        f"**Is the factorization worth it?** Measured on {_size(study)}, full model against each ablation in pairs of "
+        f"equal subject and seed ({pairs} pairs)."
+    ]
+    if pairs < 2:
+        said.append("A single training of each decides nothing; the numbers below are differences without a spread.")
+        return " ".join(said)
+    for name, found in (("novel poses", pose), ("novel views", view)):
+        parts = [
+            f"{word} {_listed([row for row, d in found.items() if d.verdict == verdict])}"
+            for word, verdict in (
+                ("better than", "better"),
+                ("worse than", "worse"),
+                ("undecided against", "undecided"),
+            )
+            if any(d.verdict == verdict for d in found.values())
+        ]
+        said.append(f"In {name} the full model is {'; '.join(parts)}.")
+    alone = [d for row, d in pose.items() if row in ("w/o {s1, c1}", "w/o {s2, c2}")]
+    both = [d.verdict == "better" for d in alone]
+    if both and all(both):
+        said.append("Two branches beat either one alone in novel poses, as the paper says.")
+    elif any(d.verdict == "worse" for d in alone):
+        said.append("A single branch does as well or better in novel poses: at this scale, no.")
+    else:
+        said.append("At this scale an advantage over both single branches is not shown beyond the noise.")
+    return " ".join(said)
+
+
+def section(study: Mapping[str, Any], table: Table) -> str:
+    """A table of differences with the paper's beside them, and the PSNR by distance from the training poses."""
+    columns = [entry for entry in COMPARED if differences(study, *entry[:2])]
+    head = ["Full model against", *[title for _, _, title, _ in columns]]
+    rows: list[list[str]] = []
+    for row in [row for row in study["rows"] if row not in FULL]:
+        words = [row]
+        for metric, better, _, column in columns:
+            found = differences(study, metric, better).get(row)
+            words.append("-" if found is None else _words(found, _papers(study, row, column)))
+        rows.append(words)
+    bins = study["extreme"]["bins"]
+    head_extreme = ["Row", *[f"bin {number + 1}" for number in range(max(map(len, bins.values()), default=0))]]
+    extreme = [
+        [row, *[f"{value:.2f} ± {error:.2f} dB at {away:.1f}°" for away, value, error, _ in points]]
+        for row, points in bins.items()
+    ]
+    return (
+        f"By how much the full model is better (a negative number: worse): mean of the pairs ± their standard "
+        f"deviation, pairs won; bold where the mean exceeds two standard errors; in parentheses the paper's difference "
+        f"on its subject 394. {_size(study, capital=True)}.\n\n{table(head, rows)}\n"
+        f"PSNR over the box in novel poses, by the distance to the nearest training pose (bins of equally many images, "
+        f"mean ± standard error over images):\n\n{table(head_extreme, extreme)}"
+    )
+
+
+def _words(difference: Difference, paper: float | None) -> str:
+    spread = "" if difference.deviation is None else f" ± {difference.deviation:.2f}"
+    text = f"{difference.mean:+.2f}{spread}"
+    text = f"**{text}**" if difference.verdict != "undecided" else text
+    return f"{text}, {difference.wins} of {difference.pairs}" + ("" if paper is None else f" ({paper:+.2f})")
+
+
+def _papers(study: Mapping[str, Any], row: str, column: str) -> float | None:
+    printed = study["printed"]
+    full = next((printed[name] for name in FULL if name in printed), {})
+    theirs = [part.get(column, [None])[0] for part in (full, printed.get(row, {}))]
+    return None if None in theirs else theirs[0] - theirs[1]
+
+
+def _size(study: Mapping[str, Any], capital: bool = False) -> str:
+    about = study["about"]
+    seeds, subjects = about["seeds"], len(about["subjects"])
+    steps = sorted(set(study["steps"].values()))
+    settings = f", {', '.join(f'`{s}`' for s in about['settings'])}" if about["settings"] else ""
+    text = (
+        f"{subjects} held-out synthetic subject{'s' * (subjects > 1)}, {seeds} seed{'s' * (seeds > 1)} each, recipe "
+        f"`{about['recipe']}` with {' or '.join(map(str, steps))} steps{settings}"
+    )
+    return text[0].upper() + text[1:] if capital else text
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

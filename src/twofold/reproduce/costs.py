@@ -1,0 +1,60 @@
+"""How long cells take: from what finished cells took here, else from what was measured once."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+
+from twofold.inputs import read_json
+from twofold.reproduce.cells import CELLS, RESULTS, TRAINING_SHARE, Cell
+
+RATES: dict[str, float] = {
+    "demo": 0.13, "quick": 0.13, "fast": 1.18, "vid2avatar_fast": 1.9, "vid2avatar_mask_fast": 0.9,
+}  # fmt: skip
+"""Seconds a step on one core, by the recipe's name, as far as they were measured; what is missing is unknown."""
+WHERE = "measured on one core of an Intel Xeon"
+
+
+def known_rates(out: Path) -> dict[str, float]:
+    """Seconds a step of the cells that are done in this folder, by the recipe's name: the median.
+
+    Raises:
+        TwofoldError: a stored file is damaged.
+    """
+    found: dict[str, list[float]] = {}
+    for file in sorted((out / CELLS).glob(f"*/{RESULTS}")):
+        results = read_json(file)
+        if isinstance(results, dict):
+            rate = results.get("seconds", {}).get("seconds_per_step")
+            if isinstance(rate, float):
+                found.setdefault(str(results.get("recipe")), []).append(rate)
+    return {name: median(rates) for name, rates in found.items()}
+
+
+def expected_seconds(cell: Cell, rates: dict[str, float]) -> float | None:
+    """Seconds from the beginning to the results; None where nobody has measured such a recipe.
+
+    An ablation counts as its full model does until one has been measured.
+    """
+    name = cell.recipe.name
+    rate = rates.get(name) or rates.get(name.partition(" ")[0]) or RATES.get(name) or RATES.get(name.partition(" ")[0])
+    return None if rate is None else rate * cell.recipe.training.steps / TRAINING_SHARE
+
+
+def left(cell: Cell, out: Path, rates: dict[str, float]) -> float | None:
+    """Seconds that are left of a cell; 0 where it is done, None where nobody knows."""
+    if cell.results(out) is not None:
+        return 0.0
+    seconds = expected_seconds(cell, rates)
+    return None if seconds is None else seconds * (1 - min(cell.share(out)[0], TRAINING_SHARE))
+
+
+def hours(seconds: Sequence[float | None], workers: int) -> str:
+    """A sum of durations over some workers, in words.
+
+    >>> hours([3600.0, 1800.0], 2), hours([600.0, None], 1), hours([None], 1), hours([], 1)
+    ('0.8 hours', 'at least 0.2 hours', 'unknown', '0.0 hours')
+    """
+    known = [s for s in seconds if s is not None]
+    if seconds and not known:
+        return "unknown"
+    return f"{'at least ' if len(known) < len(seconds) else ''}{sum(known) / workers / 3600:.1f} hours"

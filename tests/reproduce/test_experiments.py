@@ -1,0 +1,81 @@
+"""Tables as experiments: rows, recipes, shared cells."""
+
+import pytest
+
+from twofold.errors import TwofoldError
+from twofold.methods.factorized_recipes import ABLATIONS, ablation, demo_recipe
+from twofold.methods.table import RECIPES
+from twofold.reproduce.experiments import EXPERIMENTS, GRID_CM, base_recipe, planned
+from twofold.reproduce.scheduling import distinct
+from twofold.reproduce.sources import StudioSource
+
+SOURCES = [StudioSource(101), StudioSource(102)]
+
+
+def plan(name, recipe="quick", **options):
+    return planned(name, SOURCES, recipe, options.pop("seeds", 2), **options)
+
+
+@pytest.mark.parametrize("recipe", ["quick", "fast", "released"])
+@pytest.mark.parametrize("name", sorted(EXPERIMENTS))
+def test_every_table_has_each_row_for_each_subject_and_seed(name, recipe):
+    places = plan(name, recipe)
+    rows = {place.row.key for place in places}
+    assert len(places) == 4 * len(rows) == len({(p.row.key, p.subject, p.seed) for p in places})
+    assert {place.cell.recipe.seed for place in places} == {0, 1}
+    assert len(distinct([place.cell for place in places])) == len(places)
+
+
+def test_ablations_are_the_six_and_the_full_model():
+    keys = [place.row.key for place in plan("ablation", seeds=1)][:7]
+    assert keys == [*ABLATIONS, "full"]
+
+
+def test_tables_share_the_cells_that_are_the_same_training():
+    def keys(name):
+        return {place.row.key: place.cell.key for place in plan(name, seeds=1) if place.subject == "studio 101"}
+
+    main, ablations, bands, flow = (keys(name) for name in ("main", "ablation", "frequency", "consistency"))
+    assert main["factorized"] == ablations["full"] == bands["full"] == flow["full"]
+    # As in the paper, where [10] is w/o {s1, c1}.
+    assert bands["[1cm]"] == ablations["wo_s1c1"]
+    assert len({*main.values(), *ablations.values(), *bands.values()}) == 6 + 6 + 9
+
+
+def test_frequencies_of_grids_are_their_finest_spacings():
+    field = ablation("[4cm,1cm]", demo_recipe(0)).method.field
+    assert field.low_voxels == (0.08, 0.04)
+    assert field.high_voxels == (0.02, 0.01)
+    alone = ablation("[2cm]", demo_recipe(0)).method
+    assert (alone.field.branches, alone.field.high_voxels, alone.losses.common) == ("high", (0.04, 0.02), 0.0)
+
+
+def test_full_model_on_grids_is_the_one_at_the_named_spacings():
+    field = base_recipe("quick", True).method.field
+    assert min(field.low_voxels) == GRID_CM[5] / 100
+    assert min(field.high_voxels) == GRID_CM[10] / 100
+    assert ablation("[6cm,1cm]", demo_recipe(0)).method.field == field
+
+
+def test_networks_are_named_in_octaves_and_grids_in_centimetres():
+    with pytest.raises(ValueError, match="in centimetres"):
+        ablation("[5,10]", demo_recipe(0))
+    with pytest.raises(ValueError, match="in octaves"):
+        ablation("[6cm,1cm]", RECIPES["fast"]())
+
+
+def test_synthetic_subjects_have_the_settings_of_the_demo_and_real_ones_those_of_quick():
+    assert base_recipe("quick", True).training.steps == 900
+    assert base_recipe("quick", False).training.steps == RECIPES["quick"]().training.steps
+    assert base_recipe("released", True).method == RECIPES["released"]().method
+
+
+def test_settings_change_every_recipe():
+    places = plan("main", settings=["training.steps=7"])
+    assert {place.cell.recipe.training.steps for place in places} == {7}
+
+
+def test_rows_can_be_chosen_and_unknown_ones_are_refused_with_those_there_are():
+    assert {place.row.key for place in plan("main", methods=["npc", "factorized"])} == {"npc", "factorized"}
+    with pytest.raises(TwofoldError, match=r"no row 'danbo'; it has humannerf, .*factorized"):
+        plan("main", methods=["danbo"])
