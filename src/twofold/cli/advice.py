@@ -103,7 +103,7 @@ def after_rendering(run: Path, capture: Path, words: str, recipe: str) -> str:
     metrics, checkpoint = run / "metrics.json", run / "checkpoint.safetensors"
     if not metrics.is_file() or metrics.stat().st_mtime < checkpoint.stat().st_mtime:
         return words
-    return _finer(capture, recipe) or "look at them, and at the metrics in " + str(metrics)
+    return f"twofold report {run}, one page with all of it{_finer(capture, recipe)}"
 
 
 def after_evaluation(run: Path, capture: Path, words: str, recipe: str) -> str:
@@ -118,11 +118,11 @@ def after_evaluation(run: Path, capture: Path, words: str, recipe: str) -> str:
     renders, checkpoint = run / "renders", run / "checkpoint.safetensors"
     if not renders.is_dir() or renders.stat().st_mtime < checkpoint.stat().st_mtime:
         return words
-    return f"look at the images in {renders}" + "".join(f"; {more}" for more in [_finer(capture, recipe)] if more)
+    return f"twofold report {run}, one page with all of it{_finer(capture, recipe)}"
 
 
-def _finer(capture: Path, recipe: str) -> str | None:
+def _finer(capture: Path, recipe: str) -> str:
     """How to get a better avatar, where there is a way."""
     if recipe != "quick":
-        return None
-    return f"for finer detail, in hours on a CPU: twofold train {capture} --recipe fast"
+        return ""
+    return f"; for finer detail, in hours on a CPU: twofold train {capture} --recipe fast"

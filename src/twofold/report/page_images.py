@@ -22,7 +22,7 @@ from twofold.report.parts import CaptionedImage, Row, Video
 
 SPLITS = {"novel_view": "Novel views", "novel_pose": "Novel poses"}
 """Held-out splits and their headings."""
-LEAST_ROWS = 300
+MIN_ROWS = 300
 """Images with fewer rows are enlarged, so that a phone shows their pixels and not a blur."""
 FIELD, MESH = "the field, volume rendered", "the baked mesh, rasterized"
 """Which renderer made an image, in words."""
@@ -37,13 +37,15 @@ class HeldOut:
     image: RenderedImage
 
 
-def held_out(avatar: Avatar, capture: Capture, count: int, drawn: Callable[[], None] = lambda: None) -> list[HeldOut]:
+def held_out(
+    avatar: Avatar, capture: Capture, count: int, on_image: Callable[[], None] = lambda: None
+) -> list[HeldOut]:
     """Renders `count` frames of each held-out split, of different cameras where there are several."""
     found: list[HeldOut] = []
     for split in SPLITS:
         for frame in one_each(capture.splits.get(split, ()), count):
             found.append(HeldOut(split, frame, render_frame(avatar, capture, frame, True)))
-            drawn()
+            on_image()
     return found
 
 
@@ -99,13 +101,13 @@ def branches_row(shown: HeldOut) -> Row | None:
 
 @torch.no_grad()
 def canonical_images(
-    avatar: Avatar, capture: Capture, size: int, drawn: Callable[[], None] = lambda: None
+    avatar: Avatar, capture: Capture, size: int, on_image: Callable[[], None] = lambda: None
 ) -> dict[str, RenderedImage]:
     """The avatar in the canonical pose, from the front and from behind, by the field."""
     posed, found = pose_canonically(avatar), dict[str, RenderedImage]()
     for name, camera in zip(("front", "back"), orbit(posed, size, 2), strict=True):
         found[name] = render_image(avatar, posed, camera, torch.tensor(capture.background))
-        drawn()
+        on_image()
     return found
 
 
@@ -120,7 +122,7 @@ def canonical_row(images: dict[str, RenderedImage]) -> Row:
 
 def write_orbit(
     path: Path, avatar: Avatar, capture: Capture, size: int, views: int, character: PageCharacter | None,
-    drawn: Callable[[], None] = lambda: None,
+    on_image: Callable[[], None] = lambda: None,
 ) -> Video:  # fmt: skip
     """An orbit of the first training frame: by the mesh where a character is given, else by the field."""
     with torch.no_grad():
@@ -132,7 +134,7 @@ def write_orbit(
         posed = avatar.pose(frame.pose, frame.translation, frame.frame_index)
 
         def counted(image: RenderedImage) -> UInt8[np.ndarray, "h w 3"]:
-            drawn()
+            on_image()
             return to_8bit(image.color).numpy()
 
         turning = orbit_frames(avatar, posed, capture, size, views, scene_up(capture))
@@ -141,14 +143,14 @@ def write_orbit(
 
 
 def write_novel_poses(
-    path: Path, avatar: Avatar, capture: Capture, size: int, drawn: Callable[[], None] = lambda: None
+    path: Path, avatar: Avatar, capture: Capture, size: int, on_image: Callable[[], None] = lambda: None
 ) -> Video | None:
     """The held-out motion from one camera by the field; None where there is none."""
     if not capture.splits.get("novel_pose"):
         return None
 
     def counted(image: np.ndarray) -> np.ndarray:
-        drawn()
+        on_image()
         return image
 
     write_video(path, (counted(image) for image in motion_frames(avatar, capture, "novel_pose", size)), 6)
@@ -156,8 +158,8 @@ def write_novel_poses(
 
 
 def enlarged(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """The image, a whole number of times as large, so that it has at least `LEAST_ROWS` rows."""
-    times = -(-LEAST_ROWS // len(image))
+    """The image, a whole number of times as large, so that it has at least `MIN_ROWS` rows."""
+    times = -(-MIN_ROWS // len(image))
     if times <= 1:
         return image
     size = (times * image.shape[1], times * image.shape[0])
