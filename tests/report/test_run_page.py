@@ -18,9 +18,11 @@ from twofold.html.interactive import client_script
 from twofold.methods.table import RECIPES, with_settings
 from twofold.outputs.sheets import error_map
 from twofold.outputs.views import RenderedImage
+from twofold.report import page_images
 from twofold.report.page_character import joint_controls
 from twofold.report.page_images import HeldOut, branches_row, enlarged, one_each
 from twofold.report.run_page import training_command
+from twofold.training.run import load
 
 HOSTS = re.compile(r"https?://", re.IGNORECASE)
 
@@ -123,6 +125,20 @@ def test_branches_are_shown_where_there_are_two(person: Capture) -> None:
     captions = [image.caption for image in branches_row(HeldOut("novel_view", frame, both)).images]
     assert captions == ["full", "pose-independent base", "residual", "normals", "normals of the base"]
     assert branches_row(HeldOut("novel_view", frame, replace(both, base_opacity=None))) is None
+
+
+def test_a_long_motion_is_cut_and_the_page_says_so(
+    person: Capture, trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_images, "MAX_MOTION", 1)
+    whole, shown = page_images.held_out_motion(person)
+    assert (shown, whole > 1) == (1, True)
+    rendered: list[None] = []
+    avatar, _ = load(trained.folder)
+    video = page_images.write_novel_poses(tmp_path / "a.mp4", avatar, person, 16, lambda: rendered.append(None))
+    assert len(rendered) == 1
+    assert video.caption.startswith(f"The first 1 of {whole} frames")
+    assert page_images.write_novel_poses(tmp_path / "b.mp4", avatar, replace(person, splits={}), 16) is None
 
 
 def test_error_map_grows_brighter_with_the_difference() -> None:

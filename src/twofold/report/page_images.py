@@ -1,7 +1,8 @@
 """The images of a run's report: held-out frames with error maps, branches, front and back, videos."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ SPLITS = {"novel_view": "Novel views", "novel_pose": "Novel poses"}
 """Held-out splits and their headings."""
 MIN_ROWS = 300
 """Images with fewer rows are enlarged, so that a phone shows their pixels and not a blur."""
+MAX_MOTION = 60
+"""Frames of the held-out motion that the page's video shows."""
 FIELD, MESH = "the field, volume rendered", "the baked mesh, rasterized"
 """Which renderer made an image, in words."""
 
@@ -146,15 +149,24 @@ def write_novel_poses(
     path: Path, avatar: Avatar, capture: Capture, size: int, on_image: Callable[[], None] = lambda: None
 ) -> Video | None:
     """The held-out motion from one camera by the field; None where there is none."""
-    if not capture.splits.get("novel_pose"):
+    whole, shown = held_out_motion(capture)
+    if not shown:
         return None
 
-    def counted(image: np.ndarray) -> np.ndarray:
-        on_image()
-        return image
+    def images() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        for image in islice(motion_frames(avatar, capture, "novel_pose", size), shown):
+            on_image()
+            yield image
 
-    write_video(path, (counted(image) for image in motion_frames(avatar, capture, "novel_pose", size)), 6)
-    return Video(path, f"The held-out motion. Renderer: {FIELD}.")
+    write_video(path, images(), 6 if shown <= MAX_MOTION // 3 else 12)
+    part = "The held-out motion" if whole == shown else f"The first {shown} of {whole} frames of the held-out motion"
+    return Video(path, f"{part}. Renderer: {FIELD}.")
+
+
+def held_out_motion(capture: Capture) -> tuple[int, int]:
+    """How many frames the held-out motion has, and how many of them a page shows."""
+    whole = len({frame.frame_index for frame in capture.splits.get("novel_pose", ())})
+    return whole, min(whole, MAX_MOTION)
 
 
 def enlarged(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "H W 3"]:

@@ -103,7 +103,7 @@ def render_images(
     """
     held = sum(len(own.one_each(capture.splits.get(split, ()), options.frames)) for split in own.SPLITS)
     by_mesh = options.mesh and character is not None
-    moving = len({frame.frame_index for frame in capture.splits.get("novel_pose", ())})
+    _, moving = own.held_out_motion(capture)
     pieces = {"held-out frames": held, "canonical": 2, "orbit": 0 if by_mesh else options.views, "motion": moving}
     shares = Shares(pieces, {}, lambda share: progress(share, "rendering"))
     found = own.held_out(avatar, capture, options.frames, lambda: shares.done("held-out frames"))
