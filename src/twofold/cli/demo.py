@@ -1,4 +1,4 @@
-"""`twofold demo`: film a synthetic subject, train, measure, show. The whole idea in three minutes on two cores."""
+"""`twofold demo`: film a synthetic subject, train, measure, show. The whole idea in minutes on two cores."""
 
 import shlex
 import time

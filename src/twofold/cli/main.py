@@ -256,7 +256,7 @@ def _with_capture(words: list[str], capture: Path | None) -> str:
 
 
 def demo(out: Path = Path("demo"), seed: int = 0) -> None:
-    """Show the whole pipeline in three minutes: film a synthetic subject, train an avatar, measure it, write a report.
+    """Show the whole pipeline in minutes: film a synthetic subject, train an avatar, measure it, write a page.
 
     Args:
         out: Folder to make.
@@ -266,7 +266,9 @@ def demo(out: Path = Path("demo"), seed: int = 0) -> None:
 
     with bar("Demo") as progress:
         page = run_demo(out, seed, progress)
-    say(f"The page is {page}.", f"open {page}, or train on your own: twofold train CAPTURE")
+    files = " and ".join(name for name in ("avatar.glb", "avatar.vrm") if (page.parent / name).is_file())
+    character = f"; the character is in {files} beside it" if files else ""
+    say(f"The page is {page}{character}.", f"open {page}, or train on your own: twofold train CAPTURE")
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
