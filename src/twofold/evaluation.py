@@ -30,6 +30,12 @@ _MESH = 4.0
 """Images that can be measured while one surface is; a first guess, until one has been."""
 VIDEO_LENGTH = 16
 """Images of the video whose consistency is measured."""
+SURFACES = {
+    "canonical": "marching cubes of the signed distance at {voxel} in canonical space, largest piece, posed by the 7 "
+    "nearest body vertices",
+    "posed": "marching cubes of a level of the density at {voxel} in the pose itself, largest piece",
+}
+"""How a surface is found, by the space that the level belongs to (`Avatar.level_space`)."""
 MAX_IMAGES = 30
 """Images a split that are measured unless more are asked for, evenly spread: a minute or two on two cores."""
 
@@ -139,8 +145,7 @@ def measure_geometry(
     means: dict[str, object] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     means["protocol"] = {
         **shape_metrics.PROTOCOLS,
-        "surface": f"marching cubes of the signed distance at {1000 * voxel:g} mm in canonical space, largest piece, "
-        "posed by the 7 nearest body vertices",
+        "surface": SURFACES[avatar.level_space].format(voxel=f"{1000 * voxel:g} mm"),
         "moments": f"mean over {sampled(len(rows), len(_with_mesh(capture, None)), 'frames with a true mesh')}",
     }
     return means

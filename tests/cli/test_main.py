@@ -319,3 +319,12 @@ def test_the_settings_of_a_recipe_are_shown_and_each_can_be_set(capsys: pytest.C
     assert {"method.field.width", "method.sampler.radius", "training.compile", "seed"} <= {*keys}
     same = with_overrides(RECIPES["fast"](), [line.replace(" = ", "=", 1) for line in shown])
     assert same == with_overrides(RECIPES["fast"](), ["training.steps=7"])
+
+
+def test_help_has_a_line_for_each_recipe(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for name, recipe in RECIPES.items():
+        line = " ".join(str(recipe.__doc__).split("\n")[0].split())
+        assert f"{name}: {line}" in shown

@@ -4,6 +4,7 @@ What a command needs is imported when it runs, so that `--help` answers at once.
 """
 
 import functools
+import inspect
 import logging
 import os
 import shlex
@@ -18,6 +19,7 @@ import tyro
 from twofold import __version__
 from twofold.cli.advice import after_evaluation, after_rendering, require_capture, require_run
 from twofold.cli.captures import check, prepare, studio
+from twofold.cli.compare import compare
 from twofold.cli.console import ALONE, bar, console, say, within
 from twofold.cli.datasets import SplitName, capture_from, convert
 from twofold.cli.experiments_command import reproduce
@@ -53,7 +55,7 @@ def train(
         capture: Capture folder (`twofold prepare`, `twofold studio`, `twofold convert`), or a data set that
             `twofold convert` knows; captures/NAME is made of that first.
         out: Run folder to make; by default runs/NAME-RECIPE.
-        recipe: quick (minutes on a CPU), fast (the released networks, sampled near the body), released, paper.
+        recipe: Method and its settings; `twofold train --help` lists all.
         set: Settings, such as training.steps=500; one or several, once or several times.
         seed: Seed of all random numbers.
         device: auto, cpu, cuda or cuda:N.
@@ -280,6 +282,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "render": render,
     "evaluate": evaluate,
+    "compare": compare,
     "motion": motion,
     "export": export,
     "reproduce": reproduce,
@@ -294,7 +297,16 @@ def _offer_recipes() -> None:
     tune_process()
     from twofold.methods.table import RECIPES
 
-    train.__annotations__["recipe"] = Literal[tuple(RECIPES)]
+    names = Literal[tuple(RECIPES)]
+    train.__annotations__["recipe"] = Annotated[names, tyro.conf.arg(help=_recipe_help())]
+
+
+def _recipe_help() -> str:
+    """A line for each recipe: the first one of its function's docstring."""
+    from twofold.methods.table import RECIPES
+
+    lines = [f"{name}: {inspect.getdoc(recipe) or ''}".split("\n", maxsplit=1)[0] for name, recipe in RECIPES.items()]
+    return "\n".join(["Method and its settings:", *lines])
 
 
 def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
