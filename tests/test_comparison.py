@@ -48,10 +48,10 @@ def test_what_was_measured_differently_is_told_for_each_run():
 
 
 def test_shown_frames_are_of_different_cameras(person):
-    frames = shown_frames(person, "novel_view")
+    frames = shown_frames(person, "novel_view", 30)
     assert len(frames) == min(3, len(person.splits["novel_view"]))
     assert len({f.camera_name for f in frames}) == min(3, len({f.camera_name for f in person.splits["novel_view"]}))
-    assert shown_frames(replace(person, splits={"train": person.train}), "novel_pose") == []
+    assert shown_frames(replace(person, splits={"train": person.train}), "novel_pose", 30) == []
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_a_comparison_has_sheets_a_table_and_a_page(trained, pair, tmp_path):
     runs = [measured(run, capture, torch.device("cpu"), 2, 0, lambda: pieces.append(1)) for run in pair]
     out = tmp_path / "comparison"
     for _ in range(2):  # An earlier comparison is replaced.
-        write_comparison(out, capture, runs)
+        write_comparison(out, capture, runs, 2)
     stored = json.loads((out / "comparison.json").read_text())
     assert [run["run"] for run in stored["runs"]] == ["first", "second"]
     first, second = (run["metrics"]["novel_view"] for run in stored["runs"])
@@ -97,7 +97,7 @@ def test_a_comparison_has_sheets_a_table_and_a_page(trained, pair, tmp_path):
     page = (out / "report.html").read_text()
     assert "data:image/png;base64" in page
     assert "box PSNR" in page
-    frame = shown_frames(capture, "novel_view")[0]
+    frame = shown_frames(capture, "novel_view", 2)[0]
     with Image.open(out / "novel_view.png") as image:
         assert image.width > 3 * 10
         colors = np.asarray(image)
@@ -108,5 +108,5 @@ def test_a_comparison_has_sheets_a_table_and_a_page(trained, pair, tmp_path):
 def test_a_folder_with_something_else_is_left_alone(trained, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(TwofoldError, match="holds something that is no comparison"):
-        write_comparison(tmp_path, trained.capture, [])
+        write_comparison(tmp_path, trained.capture, [], 1)
     assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]

@@ -11,15 +11,14 @@ from numpy import ndarray
 
 from twofold.capture.types import Capture, Frame, spread
 from twofold.errors import TwofoldError
-from twofold.evaluation import measure_cost, measure_geometry, measure_split, render_frame
+from twofold.evaluation import measure_cost, measure_geometry, measure_split
 from twofold.files import new_folder, write_bytes, write_json
 from twofold.html.page import Table
 from twofold.inputs import shown_path
-from twofold.methods.base import Avatar
 from twofold.outputs.gallery import around_person, save_png
 from twofold.outputs.sheets import as_bytes, sheet
 from twofold.outputs.views import RenderedImage
-from twofold.report import CaptionedImage, Row, Section, number, write_report
+from twofold.report.parts import CaptionedImage, Row, Section, number, write_report
 from twofold.training.clock import read_spent
 from twofold.training.run import CHECKPOINT, find_capture, load, read_about, read_recipe, require_same
 
@@ -136,13 +135,19 @@ def measured(
     metrics: dict[str, dict[str, object]] = {}
     images: dict[str, list[UInt8[ndarray, "_ _ 3"]]] = {}
 
-    def rendered(frame: Frame, image: RenderedImage) -> None:
-        progress()
-
     for split in SPLITS:
-        if capture.splits.get(split):
+        shown = shown_frames(capture, split, most)
+        cut: dict[int, UInt8[ndarray, "_ _ 3"]] = {}
+
+        def rendered(frame: Frame, image: RenderedImage, shown: list[Frame] = shown, cut: dict[int, Any] = cut) -> None:
+            row = next((row for row, other in enumerate(shown) if other is frame), None)
+            if row is not None:
+                cut[row] = as_bytes(image.color)[around_person(frame.mask())]
+            progress()
+
+        if shown:
             metrics[split] = measure_split(avatar, capture, split, most, True, rendered)
-            images[split] = [_cut(avatar, capture, frame) for frame in shown_frames(capture, split)]
+            images[split] = [cut[row] for row in range(len(shown))]
     try:
         geometry = measure_geometry(avatar, capture, meshes, progress=progress) if meshes else {}
     except TwofoldError:
@@ -154,28 +159,32 @@ def measured(
     return ComparedRun(run.resolve().name, read_recipe(run).name, steps, metrics, images)
 
 
-def _cut(avatar: Avatar, capture: Capture, frame: Frame) -> UInt8[ndarray, "_ _ 3"]:
-    return as_bytes(render_frame(avatar, capture, frame, True).color)[around_person(frame.mask())]
+def shown_frames(capture: Capture, split: str, most: int) -> list[Frame]:
+    """Some of the frames of a split that are measured: evenly spread, each from another camera where there are several.
 
-
-def shown_frames(capture: Capture, split: str) -> list[Frame]:
-    """A few frames of a split: evenly spread, each from another camera where there are several."""
-    frames = capture.splits.get(split, ())
+    Args:
+        capture: of the runs.
+        split: "novel_view" or "novel_pose".
+        most: images measured of the split.
+    """
+    frames = spread(capture.splits.get(split, ()), most)
     cameras = sorted({frame.camera_name for frame in frames})
     chosen: list[Frame] = []
     for row in range(min(ROWS, len(frames))):
-        own = [frame for frame in frames if frame.camera_name == cameras[row % len(cameras)]]
-        chosen.append(own[round((row + 0.5) / ROWS * (len(own) - 1))])
+        own = [f for f in frames if f.camera_name == cameras[row % len(cameras)] and all(f is not c for c in chosen)]
+        if own:
+            chosen.append(own[round((row + 0.5) / ROWS * (len(own) - 1))])
     return chosen
 
 
-def write_comparison(folder: Path, capture: Capture, runs: Sequence[ComparedRun]) -> None:
+def write_comparison(folder: Path, capture: Capture, runs: Sequence[ComparedRun], most: int) -> None:
     """Writes sheets (PNG), the table (JSON, Markdown) and a page (HTML), all or nothing.
 
     Args:
         folder: to make; an earlier comparison is replaced.
         capture: of all runs.
         runs: in the order of columns and lines.
+        most: images measured of each split.
 
     Raises:
         TwofoldError: the folder holds something else, or cannot be written.
@@ -186,7 +195,7 @@ def write_comparison(folder: Path, capture: Capture, runs: Sequence[ComparedRun]
     with new_folder(folder, replace=folder.exists()) as place:
         sections: list[Section] = []
         for split, heading in SPLITS.items():
-            frames = shown_frames(capture, split)
+            frames = shown_frames(capture, split, most)
             if not frames:
                 continue
             truth = [as_bytes(f.composited(background))[around_person(f.mask())] for f in frames]
@@ -239,7 +248,7 @@ def _value(run: ComparedRun, column: Column) -> float | int | None:
 
 
 def shared_protocol(runs: Sequence[ComparedRun]) -> dict[str, str]:
-    """How the numbers of the table were measured; what differs between runs is told for each."""
+    """How the numbers of the table were measured; what differs between runs stands there for each."""
     told: dict[str, str] = {}
     for section in dict.fromkeys(section for run in runs for section in run.metrics):
         protocols = {run.name: _protocol(run.metrics.get(section, {})) for run in runs}

@@ -190,3 +190,4 @@ def test_interrupted_training_resumes_to_the_same_numbers_with_its_key_frames(pe
 def test_training_names_key_frames_that_do_not_exist(person, tmp_path):
     with pytest.raises(TwofoldError, match="key_frames names frame 99"):
         train(person, small(key_frames=(0, 99)), tmp_path / "run", torch.device("cpu"))
+    assert not (tmp_path / "run").exists()

@@ -53,7 +53,7 @@ def compare(
 
             found.append(measured(run, read, where, max_images, max_meshes, progress))
             progress()
-        write_comparison(out, read, found)
+        write_comparison(out, read, found, max_images)
         show(1.0, "")
     say(
         f"The comparison is in {out}.", f"open {out / 'report.html'}, or put {out / 'comparison.md'} where you need it."

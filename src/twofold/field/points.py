@@ -76,7 +76,8 @@ def choose_positions(
         if len(own) < count:
             raise TwofoldError(
                 f"NPC needs {count} surface points for each body part, the {JOINT_NAMES[joint]} has {len(own)}; train "
-                "its first stage longer, or on more frames that show this part."
+                "its first stage longer (method.first_steps), on more frames that show this part, or with fewer points "
+                "(method.points)."
             )
         columns.append(own[farthest_points(own * half_sizes[index], count)])
     return torch.stack(columns, 1)

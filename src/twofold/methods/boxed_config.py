@@ -1,6 +1,6 @@
 """Settings that PM-Avatar, DANBO and NPC share, and what they derive from a pose and answer at points."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
 
 from jaxtyping import Float
@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from twofold.config import require_within
+from twofold.recipe import PixelConfig, TrainingConfig
 
 Shared = TypeVar("Shared")
 
@@ -75,3 +76,31 @@ class Radiance:
     density: Float[Tensor, "S"]
     color: Float[Tensor, "S 3"]
     extra: Float[Tensor, "S"]
+
+
+def released_training(steps: int, rays: int, decay: float, clip: float = 0.0) -> TrainingConfig:
+    """How the authors' programs train: rays near the person from 16 images a step, exponential decay from the start.
+
+    Args:
+        steps: of the training.
+        rays: of each image.
+        decay: what the rates are multiplied with in the end.
+        clip: largest global norm of the gradient; 0 for no limit.
+    """
+    pixels = PixelConfig(rays=rays, subject_share=1.0, surroundings=6, patches=0)
+    return TrainingConfig(
+        steps=steps, images_per_step=16, pixels=pixels, milestones=(), decay=decay, decay_from=0.0, clip=clip
+    )
+
+
+def affordable(settings: BoxedSettings, coarse: int = 32, fine: int = 16) -> BoxedSettings:
+    """Fewer samples, only near the body, in bfloat16 where the processor is made for it; the equations stay."""
+    return replace(settings, coarse=coarse, fine=fine, max_distance=0.07, hidden_dtype="auto")
+
+
+def short_training(training: TrainingConfig, steps: int = 3000) -> TrainingConfig:
+    """About half an hour on two cores: 256 rays of one image a step, a warm-up, rates that fall to a tenth."""
+    return replace(
+        training, steps=steps, images_per_step=1, pixels=replace(training.pixels, rays=256), warmup=50, decay=0.1,
+        decay_from=0.3, clip=1.0, checkpoint_every=200,
+    )  # fmt: skip

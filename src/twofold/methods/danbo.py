@@ -12,10 +12,17 @@ from twofold.field.bone_boxes import RIGID_PARTS
 from twofold.losses import box_assignment, box_volumes
 from twofold.methods.base import Batch, MethodConfig, Mode, ParameterGroup, PosedAvatar, Rendering
 from twofold.methods.boxed_avatar import BoxedAvatar
-from twofold.methods.boxed_config import BoxedPose, BoxedSettings, Radiance
+from twofold.methods.boxed_config import (
+    BoxedPose,
+    BoxedSettings,
+    Radiance,
+    affordable,
+    released_training,
+    short_training,
+)
 from twofold.methods.local_radiance import POSE_OCTAVES, LocalRadiance, inside_rigid
 from twofold.methods.subject import Subject
-from twofold.recipe import PixelConfig, Recipe, TrainingConfig
+from twofold.recipe import Recipe
 
 
 @dataclass(frozen=True)
@@ -103,23 +110,14 @@ class DanboAvatar(BoxedAvatar[Tensor]):
 
 def danbo() -> Recipe:
     """The authors' program, as NPC runs it: 3072 rays from 16 images a step. Half an hour on a GPU."""
-    pixels = PixelConfig(rays=192, subject_share=1.0, surroundings=6, patches=0)
-    training = TrainingConfig(
-        steps=10_000, images_per_step=16, pixels=pixels, milestones=(), decay=0.1 ** (10_000 / 500_000),
-        decay_from=0.0, clip=0.0,
-    )  # fmt: skip
-    return Recipe("danbo", DanboConfig(), training)
+    return Recipe("danbo", DanboConfig(), released_training(steps=10_000, rays=192, decay=0.1 ** (10_000 / 500_000)))
 
 
 def danbo_fast() -> Recipe:
     """The same networks and losses; only samples near the body, one image a step, a short schedule."""
     start = danbo()
-    boxed = replace(start.method.boxed, coarse=32, fine=16, max_distance=0.07, hidden_dtype="auto")
-    training = replace(
-        start.training, steps=3000, images_per_step=1, pixels=replace(start.training.pixels, rays=256),
-        warmup=50, decay=0.1, decay_from=0.3, clip=1.0, checkpoint_every=200,
-    )  # fmt: skip
-    return replace(start, name="danbo_fast", method=replace(start.method, boxed=boxed), training=training)
+    method = replace(start.method, boxed=affordable(start.method.boxed))
+    return replace(start, name="danbo_fast", method=method, training=short_training(start.training))
 
 
 RECIPES: dict[str, Callable[[], Recipe]] = {"danbo": danbo, "danbo_fast": danbo_fast}

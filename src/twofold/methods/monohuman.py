@@ -18,7 +18,7 @@ from twofold.field.resunet import ResUNet, ViewBlending, sample_maps
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse
 from twofold.losses import CONSISTENT_LIKELIHOOD, deformation_consistency
 from twofold.methods.base import EVALUATION, Batch, MethodConfig, Mode, Rendering
-from twofold.methods.key_frames import MIN_SIDE, read_key_frames
+from twofold.methods.key_frames import MIN_SIDE, named_frames, read_key_frames
 from twofold.methods.skeletal import Posed, SkeletalAvatar, aligned
 from twofold.methods.skeletal_config import MAX_STEPS, SkeletalConfig, SkeletalRates, affordable
 from twofold.methods.subject import Subject
@@ -94,6 +94,14 @@ class MonoHumanAvatar(SkeletalAvatar):
     def motions(self) -> list[nn.Module]:
         """See `SkeletalAvatar.motions`."""
         return [self.backward_motion, self.forward_motion]
+
+    def check_capture(self, capture: Capture) -> None:
+        """See `Avatar.check_capture`: key frames that the settings name have to be there.
+
+        Raises:
+            TwofoldError: see `named_frames`.
+        """
+        named_frames(capture, self.config.key_frames)
 
     def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
         """See `Avatar.prepare_training`: reads the key frames.

@@ -14,11 +14,18 @@ from twofold.geometry.cameras import Rays
 from twofold.losses import background, box_assignment, box_volumes
 from twofold.methods.base import Batch, MethodConfig, Mode, ParameterGroup, PosedAvatar, Rendering, Stage
 from twofold.methods.boxed_avatar import CODE_SPREAD, BoxedAvatar
-from twofold.methods.boxed_config import BoxedPose, BoxedSettings, Radiance
+from twofold.methods.boxed_config import (
+    BoxedPose,
+    BoxedSettings,
+    Radiance,
+    affordable,
+    released_training,
+    short_training,
+)
 from twofold.methods.local_radiance import POSE_OCTAVES, LocalRadiance, inside_rigid
 from twofold.methods.point_networks import PointNetworks, PointWeights, ReadyPoints, surface_positions
 from twofold.methods.subject import Subject
-from twofold.recipe import PixelConfig, Recipe, TrainingConfig
+from twofold.recipe import Recipe, TrainingConfig
 from twofold.volume.nerf_compositing import open_density_weights, without_thin_density
 from twofold.volume.samples import Samples
 
@@ -270,29 +277,20 @@ def _intrinsics(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 4"]:
 
 def npc() -> Recipe:
     """The authors' program: DANBO's 10,000 steps, then 300,000 of 4096 rays from 16 images. Days on a CPU."""
-    pixels = PixelConfig(rays=256, subject_share=1.0, surroundings=6, patches=0)
-    training = TrainingConfig(
-        steps=300_000, images_per_step=16, pixels=pixels, milestones=(), decay=0.2 ** (300_000 / DECAY_STEPS),
-        decay_from=0.0, clip=0.0,
-    )  # fmt: skip
+    training = released_training(steps=300_000, rays=256, decay=0.2 ** (300_000 / DECAY_STEPS))
     return Recipe("npc", NpcConfig(), training)
 
 
 def npc_fast() -> Recipe:
     """The same networks and losses; only samples near the body, one image a step, short schedules."""
     start = npc()
-    near = {"max_distance": 0.07, "hidden_dtype": "auto"}
     method = replace(
         start.method,
-        first=replace(start.method.first, coarse=32, fine=16, **near),
-        boxed=replace(start.method.boxed, coarse=40, fine=20, **near),
+        first=affordable(start.method.first),
+        boxed=affordable(start.method.boxed, coarse=40, fine=20),
         first_steps=2000, first_rays=256, first_decay=0.3, point_voxel=0.006, background=0.0,
     )  # fmt: skip
-    training = replace(
-        start.training, steps=3000, images_per_step=1, warmup=50, decay=0.1, decay_from=0.3, clip=1.0,
-        checkpoint_every=200,
-    )  # fmt: skip
-    return replace(start, name="npc_fast", method=method, training=training)
+    return replace(start, name="npc_fast", method=method, training=short_training(start.training))
 
 
 RECIPES: dict[str, Callable[[], Recipe]] = {"npc": npc, "npc_fast": npc_fast}

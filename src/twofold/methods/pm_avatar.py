@@ -17,9 +17,16 @@ from twofold.geometry.cameras import Rays
 from twofold.losses import box_volumes
 from twofold.methods.base import Batch, MethodConfig, Mode, ParameterGroup, PosedAvatar, Rendering
 from twofold.methods.boxed_avatar import BoxedAvatar
-from twofold.methods.boxed_config import BoxedPose, BoxedSettings, Radiance
+from twofold.methods.boxed_config import (
+    BoxedPose,
+    BoxedSettings,
+    Radiance,
+    affordable,
+    released_training,
+    short_training,
+)
 from twofold.methods.subject import Subject
-from twofold.recipe import PixelConfig, Recipe, TrainingConfig
+from twofold.recipe import Recipe
 
 VIEW_COLUMNS = 16
 
@@ -119,24 +126,15 @@ class PmAvatar(BoxedAvatar[Tensor]):
 
 def pm_avatar() -> Recipe:
     """The authors' program: all samples of 3072 rays from 16 images a step. Weeks on a CPU, hours on a GPU."""
-    pixels = PixelConfig(rays=192, subject_share=1.0, surroundings=6, patches=0)
-    training = TrainingConfig(
-        steps=300_000, images_per_step=16, pixels=pixels, milestones=(), decay=0.1 ** (300_000 / 500_000),
-        decay_from=0.0, checkpoint_every=500,
-    )  # fmt: skip
+    training = released_training(steps=300_000, rays=192, decay=0.1 ** (300_000 / 500_000), clip=1.0)
     return Recipe("pm_avatar", PmAvatarConfig(), training)
 
 
 def pm_avatar_fast() -> Recipe:
     """The same networks and losses; only samples in a box's window, one image a step, a short schedule."""
     start = pm_avatar()
-    boxed = replace(start.method.boxed, coarse=32, fine=16, max_distance=0.07, hidden_dtype="auto")
-    method = replace(start.method, boxed=boxed, min_window=1e-4, misses="empty")
-    training = replace(
-        start.training, steps=3000, images_per_step=1, pixels=replace(start.training.pixels, rays=256),
-        warmup=50, decay=0.1, decay_from=0.3, checkpoint_every=200,
-    )  # fmt: skip
-    return replace(start, name="pm_avatar_fast", method=method, training=training)
+    method = replace(start.method, boxed=affordable(start.method.boxed), min_window=1e-4, misses="empty")
+    return replace(start, name="pm_avatar_fast", method=method, training=short_training(start.training))
 
 
 RECIPES: dict[str, Callable[[], Recipe]] = {"pm_avatar": pm_avatar, "pm_avatar_fast": pm_avatar_fast}

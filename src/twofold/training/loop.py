@@ -229,7 +229,7 @@ def train(
                     require_finite(avatar.state_dict(), folder, done)
                 if done == steps:
                     require_finite({"the surface": _level_on_body(avatar, capture.train[0])}, folder, done)
-                if done % config.checkpoint_every == 0 or done == steps or stop:
+                if done % config.checkpoint_every == 0 or done in run.ends or stop:
                     # In this order: the curves are cut back to the checkpoint, not the other way round.
                     curves.save()
                     write_checkpoint(folder, avatar, run.optimizer, done, run.restarts, clock.spent())
