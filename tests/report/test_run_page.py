@@ -21,7 +21,7 @@ from twofold.outputs.views import RenderedImage
 from twofold.report import page_images
 from twofold.report.page_character import joint_controls
 from twofold.report.page_images import HeldOut, branches_row, enlarged, one_each
-from twofold.report.run_page import training_command
+from twofold.report.run_page import shareable, training_command
 from twofold.training.run import load
 
 HOSTS = re.compile(r"https?://", re.IGNORECASE)
@@ -32,7 +32,7 @@ def written(trained, person_folder: Path, tmp_path_factory: pytest.TempPathFacto
     """The page of a small run, made by the command."""
     pytest.importorskip("xatlas")
     pytest.importorskip("fast_simplification")
-    run = tmp_path_factory.mktemp("reported") / 'run </script> & "co"'
+    run = tmp_path_factory.mktemp("reported") / 'run <script> & "co"'
     shutil.copytree(trained.folder, run)
     words = ["--size", "64", "--frames", "2", "--max-images", "2", "--max-meshes", "1", "--faces", "800"]
     main(
@@ -74,7 +74,7 @@ def test_a_strange_name_of_the_run_breaks_nothing(written: tuple[Path, Page]) ->
     text = path.read_text()
     without = text.replace(str(client_script()), "")
     assert without.count("</script>") == len(page.all("script"))
-    assert 'run </script> & "co"' in page.text
+    assert 'run <script> & "co"' in page.text
 
 
 def test_small_page_for_a_small_run(written: tuple[Path, Page]) -> None:
@@ -115,6 +115,17 @@ def test_training_command_names_what_differs_from_the_recipe() -> None:
     words = training_command(recipe, Path("cap"), Path("runs/a b"))
     assert words == "twofold train cap --out 'runs/a b' --recipe quick --seed 3 --set training.steps=77"
     assert training_command(RECIPES["fast"](), Path("c"), Path("r")) == "twofold train c --out r --recipe fast"
+
+
+def test_paths_on_the_page_do_not_tell_where_its_maker_works(
+    written: tuple[Path, Page], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, page = written
+    assert str(path.parent.parent) not in page.text
+    monkeypatch.chdir(tmp_path)
+    assert shareable(tmp_path / "runs" / "me") == Path("runs/me")
+    assert shareable(Path("runs/me")) == Path("runs/me")
+    assert shareable(tmp_path.parent / "other" / "me") == Path("me")
 
 
 def test_branches_are_shown_where_there_are_two(person: Capture) -> None:

@@ -33,7 +33,7 @@ from twofold.report.page_images import (
     write_orbit,
 )
 from twofold.report.parts import key_metric
-from twofold.report.run_page import PageImages, PageTexts, write_page
+from twofold.report.run_page import PageImages, PageTexts, shareable, write_page
 from twofold.studio.generate import StudioConfig, make_studio
 from twofold.training.lock import locked
 from twofold.training.loop import Progress, train
@@ -165,7 +165,7 @@ def _images(
 
 
 def _texts(out: Path, seed: int, metrics: dict[str, object]) -> PageTexts:
-    run = out / "run"
+    run = shlex.quote(str(shareable(out / "run")))
     return PageTexts(
         "An animatable avatar from one camera",
         f"Synthetic subject {seed}: {FRAMES * 4 // 5} training images of {SIZE} x {SIZE}, recipe quick. One camera "

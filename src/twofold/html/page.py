@@ -63,10 +63,12 @@ class EmbeddedVideo:
     Attributes:
         source: a data address with the whole content.
         caption: below it; empty for none.
+        size: width and height, pixels, where they are known.
     """
 
     source: str
     caption: str = ""
+    size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -142,8 +144,8 @@ def embedded_image(
     return EmbeddedImage(f"data:image/{stored};base64,{base64.b64encode(content).decode()}", width, height, caption)
 
 
-def embedded_video(path: Path, caption: str = "") -> EmbeddedVideo:
-    """A video (MP4) with its content inside.
+def embedded_video(path: Path, caption: str = "", size: tuple[int, int] | None = None) -> EmbeddedVideo:
+    """A video (MP4) with its content inside, of this width and height.
 
     Raises:
         TwofoldError: the file is missing or of another kind.
@@ -152,7 +154,7 @@ def embedded_video(path: Path, caption: str = "") -> EmbeddedVideo:
         raise TwofoldError(f"The report's video {path} is no .mp4.")
     if not path.is_file():
         raise TwofoldError(f"The report's video {path} is missing; render it first.")
-    return EmbeddedVideo(f"data:video/mp4;base64,{base64.b64encode(path.read_bytes()).decode()}", caption)
+    return EmbeddedVideo(f"data:video/mp4;base64,{base64.b64encode(path.read_bytes()).decode()}", caption, size)
 
 
 @functools.cache

@@ -132,7 +132,7 @@ def write_orbit(
         if character is not None:
             frames = mesh_orbit(character.character, size, views, np.array(capture.background))
             write_video(path, frames, max(views // 3, 1))
-            return Video(path, f"Orbit. Renderer: {MESH}.")
+            return Video(path, f"Orbit. Renderer: {MESH}.", (size, size))
         frame = capture.train[0]
         posed = avatar.pose(frame.pose, frame.translation, frame.frame_index)
 
@@ -142,7 +142,7 @@ def write_orbit(
 
         turning = orbit_frames(avatar, posed, capture, size, views, scene_up(capture))
         write_video(path, (counted(image) for image in turning), max(views // 3, 1))
-    return Video(path, f"Orbit. Renderer: {FIELD}.")
+    return Video(path, f"Orbit. Renderer: {FIELD}.", (size, size))
 
 
 def write_novel_poses(
@@ -153,14 +153,17 @@ def write_novel_poses(
     if not shown:
         return None
 
+    extent: list[tuple[int, int]] = []
+
     def images() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         for image in islice(motion_frames(avatar, capture, "novel_pose", size), shown):
             on_image()
+            extent.append((image.shape[1], image.shape[0]))
             yield image
 
     write_video(path, images(), 6 if shown <= MAX_MOTION // 3 else 12)
     part = "The held-out motion" if whole == shown else f"The first {shown} of {whole} frames of the held-out motion"
-    return Video(path, f"{part}. Renderer: {FIELD}.")
+    return Video(path, f"{part}. Renderer: {FIELD}.", extent[0])
 
 
 def held_out_motion(capture: Capture) -> tuple[int, int]:

@@ -55,6 +55,8 @@ class Video:
 
     file: str | Path
     caption: str = ""
+    size: tuple[int, int] | None = None
+    """Width and height, pixels, so that the page keeps the place before the video is there."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ def _shown(part: Part | CaptionedImage, folder: Path) -> object:
     if isinstance(part, CaptionedImage):
         return _embedded(part)
     if isinstance(part, Video):
-        return embedded_video(folder / part.file, part.caption)
+        return embedded_video(folder / part.file, part.caption, part.size)
     if isinstance(part, Row):
         return {"label": part.label, "wrapped": part.wrapped, "images": [_embedded(image) for image in part.images]}
     if isinstance(part, Chart):

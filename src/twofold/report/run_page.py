@@ -254,13 +254,13 @@ def run_texts(run: Path, source: Path, capture: Capture, metrics: Mapping[str, o
         key_metric(metrics, "geometry.chamfer_cm", "surface error", "cm"),
     ]
     known = [metric for metric in shown if metric.unit or any(letter.isdigit() for letter in metric.value)]
-    name = shlex.quote(str(run))
+    name = shlex.quote(str(shareable(run)))
     return PageTexts(
         f"Avatar of {source.resolve().name}",
         f"{len(capture.train)} training images of {size.width} x {size.height}, recipe {recipe.name}.",
         known,
         (
-            (training_command(recipe, source, run), "train"),
+            (training_command(recipe, shareable(source), shareable(run)), "train"),
             (f"twofold evaluate {name}", "measure"),
             (f"twofold report {name}", "make this page"),
         ),
@@ -270,6 +270,12 @@ def run_texts(run: Path, source: Path, capture: Capture, metrics: Mapping[str, o
         ),
         capture.credit,
     )
+
+
+def shareable(path: Path) -> Path:
+    """A path without the folders of the person who makes the page: from the current folder, or its name alone."""
+    whole = path.resolve()
+    return whole.relative_to(Path.cwd()) if whole.is_relative_to(Path.cwd()) else Path(whole.name)
 
 
 def training_command(recipe: Recipe, source: Path, run: Path) -> str:
