@@ -11,6 +11,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.study_section import answer, section
+
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, PAGE, README = ROOT / "benchmarks" / "results", ROOT / "docs" / "results.md", ROOT / "README.md"
 BEGIN, END = "<!-- results -->\n", "<!-- /results -->\n"
@@ -50,10 +52,14 @@ def load(folder: Path = RESULTS) -> dict[str, Any]:
 def results_page(results: dict[str, Any]) -> str:
     """The page, Markdown."""
     machines = "; ".join(sorted(set(map(_machine, _benchmarks(results)))))
+    study = results.get("study-ablation")
     parts = [
-        "# Results\n\nMade from the JSON files in `benchmarks/results/` by `python -m benchmarks.results_page`. All "
+        "# Results\n\n"
+        + (f"{answer(study)}\n\n" if study else "")
+        + "Made from the JSON files in `benchmarks/results/` by `python -m benchmarks.results_page`. All "
         f"numbers are from CPUs: {machines}.\n",
         f"## Avatars and fits\n\n{_captures(results['captures'])}",
+        *_studies(results),
         "## Training step\n\nSame networks, rays and losses. `fast` has the paper's network sizes, the shell sampler, "
         "a hand-written reverse pass and bfloat16 hidden layers; the reference form is the usual one: error-bounded "
         "sampler, autograd through autograd, dense samples, float32. `python -m benchmarks.step`.\n\n"
@@ -116,6 +122,16 @@ def _named(results: dict[str, Any], prefix: str) -> dict[str, Any]:
 
 def _benchmarks(results: dict[str, Any]) -> list[dict[str, Any]]:
     return [result for prefix in ("step-", "rendering-", "quality-") for result in _named(results, prefix).values()]
+
+
+def _studies(results: dict[str, Any]) -> list[str]:
+    """A section for each stored study."""
+    titles = {"study-ablation": "## What each part of the factorization is worth"}
+    return [
+        f"{titles.get(name, f'## Study {name[6:]}')}\n\n{section(study, _table)}"
+        for name, study in results.items()
+        if name.startswith("study-")
+    ]
 
 
 def _machine(result: dict[str, Any]) -> str:

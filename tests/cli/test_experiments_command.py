@@ -1,6 +1,10 @@
 """`twofold reproduce` on the command line."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 from command_line import refused, set_small
@@ -31,7 +35,7 @@ def test_dry_run_lists_cells_and_hours_and_does_nothing(tmp_path, capsys):
     main(["reproduce", "ablation", "--out", str(tmp_path / "r"), "--seeds", "2", "--dry-run"])
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 15
-    assert all("not begun" in line and " hours left" in line for line in lines[:-1])
+    assert all("not begun" in line and " left" in line for line in lines[:-1])
     assert lines[-1].startswith("14 cells, ")
     assert not (tmp_path / "r").exists()
 
@@ -109,3 +113,34 @@ def test_a_capture_is_trained_and_measured_to_the_end(person_folder, tmp_path, c
 def test_bad_options_are_refused_in_a_sentence(tmp_path, capsys, words, expected):
     assert expected in refused(capsys, "reproduce", *words, "--out", tmp_path / "r")
     assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="sends signals")
+def test_command_interrupted_twice_ends_with_the_same_table(person_folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", ":".join(sys.path))
+
+    def run(out, stopped):
+        words = ["reproduce", "ablation", "--methods", "full", "wo_feat", "--data", str(person_folder)]
+        words += ["--out", str(out), "--max-images", "2", "--max-meshes", "1", *set_small(100)]
+        for note in out.glob("cells/*/progress.json"):
+            note.unlink()
+        process = subprocess.Popen([sys.executable, "-m", "twofold", *words], stderr=subprocess.PIPE, text=True)
+        while stopped and process.poll() is None:
+            notes = [file.read_text() for file in out.glob("cells/*/progress.json")]
+            if any("step" in note for note in notes):
+                process.send_signal(signal.SIGINT)
+                break
+            time.sleep(0.02)
+        said = process.communicate()[1]
+        return process.returncode, said
+
+    assert run(tmp_path / "whole", False)[0] == 0
+    for _ in range(2):
+        code, said = run(tmp_path / "parts", True)
+        assert code == 130, said
+        assert "the same command goes on from there" in said
+        assert "Traceback" not in said
+    assert run(tmp_path / "parts", False)[0] == 0
+    name = f"tables/ablation-{person_folder.name}-quick.json"
+    assert (tmp_path / "parts" / name).read_text() == (tmp_path / "whole" / name).read_text()

@@ -8,7 +8,8 @@ from twofold.inputs import read_json
 from twofold.reproduce.cells import CELLS, RESULTS, TRAINING_SHARE, Cell
 
 RATES: dict[str, float] = {
-    "demo": 0.13, "quick": 0.13, "fast": 1.18, "vid2avatar_fast": 1.9, "vid2avatar_mask_fast": 0.9,
+    "demo": 0.13, "quick": 0.13, "fast": 1.18, "humannerf_fast": 0.48, "monohuman_fast": 0.66, "pm_avatar_fast": 0.5,
+    "vid2avatar_fast": 1.9, "vid2avatar_mask_fast": 0.9,
 }  # fmt: skip
 """Seconds a step on one core, by the recipe's name, as far as they were measured; what is missing is unknown."""
 WHERE = "measured on one core of an Intel Xeon"
@@ -51,10 +52,12 @@ def left(cell: Cell, out: Path, rates: dict[str, float]) -> float | None:
 def hours(seconds: Sequence[float | None], workers: int) -> str:
     """A sum of durations over some workers, in words.
 
-    >>> hours([3600.0, 1800.0], 2), hours([600.0, None], 1), hours([None], 1), hours([], 1)
-    ('0.8 hours', 'at least 0.2 hours', 'unknown', '0.0 hours')
+    >>> hours([7200.0, 1800.0], 2), hours([600.0, None], 1), hours([None], 1), hours([], 1)
+    ('1.2 hours', 'at least 10 minutes', 'unknown', '0 minutes')
     """
     known = [s for s in seconds if s is not None]
     if seconds and not known:
         return "unknown"
-    return f"{'at least ' if len(known) < len(seconds) else ''}{sum(known) / workers / 3600:.1f} hours"
+    minutes = sum(known) / workers / 60
+    words = f"{minutes:.0f} minutes" if minutes < 60 else f"{minutes / 60:.1f} hours"
+    return f"at least {words}" if len(known) < len(seconds) else words
