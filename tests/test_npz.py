@@ -152,7 +152,7 @@ def test_a_bomb_is_seen_before_memory_is_taken(tmp_path):
 
 @pytest.mark.parametrize(("begins", "called"), [
     (b"HIERARCHY\nROOT Hips\n{", "a BVH motion"), (b"\xef\xbb\xbf\r\nHIERARCHY", "a BVH motion"),
-    (b"\x80\x04\x95", "a pickle, as WHAM, HumanNeRF"), (b"\x78\x9c\xed", "a pickle"), (b'{"poses": []}', "a JSON file"),
+    (b"\x80\x04\x95", "a pickle, expected an npz"), (b"\x78\x9c\xed", "a pickle"), (b'{"poses": []}', "a JSON file"),
     (b"\x89HDF\r\n", "an HDF5 or MATLAB file"), (b"", "damaged or no npz file"), (b"PK\x03\x04cut", "damaged"),
 ])  # fmt: skip
 def test_files_of_other_programs_are_called_by_their_kind(begins, called, tmp_path):

@@ -4,13 +4,15 @@ NumPy's own reader unpickles plainly, and evaluates headers as Python expression
 """
 
 import re
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from twofold.errors import TwofoldError
-from twofold.inputs import read_bytes
+from twofold.inputs import opened, read_bytes
 from twofold.pickles import MAX_BYTES, MAX_OPCODES, pickle_error, unpickled
 
 _MAX_HEADER = 10_000
@@ -74,3 +76,32 @@ def _npy_content(raw: bytes, path: Path | str, what: str, max_opcodes: int) -> A
         raise EOFError
     content = np.frombuffer(raw, item, count, begin)
     return content.reshape(shape, order="F" if order[1] == "True" else "C")
+
+
+def read_npz_object(path: Path | str, name: str, what: str, limit: int = MAX_BYTES, only_names: bool = False) -> Any:
+    """One array of an npz file, or the containers and arrays of one of Python objects; None where it is missing.
+
+    Args:
+        path: of the file.
+        name: of the array.
+        what: it is, for the sentences.
+        limit: of its size in bytes.
+        only_names: whether it is enough to know that it is there: True then.
+
+    Raises:
+        TwofoldError: the file is missing, damaged or too large, or holds something else.
+    """
+    with opened(path, 2 * limit) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+                if name not in members or only_names:
+                    return True if name in members else None
+                if members[name].file_size > limit:
+                    raise TwofoldError(f"{name} in {path} is larger than {limit >> 20} MiB, too much for {what}.")
+                raw = archive.read(members[name])
+        except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
+            if only_names:
+                return None
+            raise TwofoldError(f"{path} is damaged or cut short, expected {what}; get the file again.") from error
+    return npy_content(raw, path, what)

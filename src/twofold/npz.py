@@ -85,10 +85,7 @@ def foreign_kind(begins: bytes) -> str | None:
     if begins.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"HIERARCHY"):
         return "a BVH motion, expected an npz file; save its poses with np.savez"
     if re.match(rb"\x80[\x02-\x05]|ZF0x|\x78[\x01\x5e\x9c\xda]", begins):
-        return (
-            "a pickle, as WHAM, HumanNeRF and others write them, which may run code and is never opened; save its "
-            "arrays with np.savez, where it was made"
-        )
+        return "a pickle, expected an npz file; save its arrays with np.savez, where it was made"
     if begins.lstrip().startswith((b"{", b"[")):
         return "a JSON file, expected an npz file; save its arrays with np.savez"
     if begins.startswith(b"\x89HDF"):

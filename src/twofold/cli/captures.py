@@ -51,6 +51,8 @@ def prepare(
     masks: Path | None = None,
     landmarks: Path | None = None,
     poses: Path | None = None,
+    track: int | None = None,
+    smplx: Path | None = None,
     train_camera: str | None = None,
     held_out: int = 10,
     held_objects: Literal["keep", "remove"] = "remove",
@@ -72,7 +74,10 @@ def prepare(
         body: anny, or your own SMPL file.
         masks: Your own masks instead of the estimator's: a folder (one folder for each of several videos in it).
         landmarks: Your own landmarks: a file (a folder with one file for each of several videos).
-        poses: Your own poses of the body, as npz with poses, translations and betas; nothing is fitted then.
+        poses: Your own poses of the body, and nothing is fitted: results of ROMP, 4D-Humans, WHAM, GVHMR, EasyMocap,
+            or an npz with poses, translations and betas.
+        track: Whom of several people in these poses, by the estimator's number; by default who is seen longest.
+        smplx: Your own SMPL-X file, which the results of GVHMR need.
         train_camera: Which of several videos trains; by default the first.
         held_out: Every Nth frame is held out for testing.
         held_objects: Whether a ball or the like that moves apart from the body is taken out of the masks.
@@ -91,7 +96,7 @@ def prepare(
 
     config = PrepareConfig(
         fps, max_size, read_intrinsics(intrinsics), calibration, train_camera, held_out, held_objects, credit,
-        masks, landmarks, poses, several_people, person, read_frames(drop), refine_masks,
+        masks, landmarks, poses, track, smplx, several_people, person, read_frames(drop), refine_masks,
     )  # fmt: skip
     with bar("Preparing") as progress:
         prepared = make(videos, out, read_body(body), mediapipe_estimator, config, progress, count_people)

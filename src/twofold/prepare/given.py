@@ -17,10 +17,12 @@ from twofold.prepare.detect.mask_files import GivenMasks, masks_from_folder
 from twofold.prepare.detect.people import Person
 from twofold.prepare.detect.person import JOINT_LINES, Region, around_landmarks, around_lines, following
 from twofold.prepare.detections import Track
+from twofold.prepare.estimators.estimates import PoseOptions
 from twofold.prepare.fitting.parameters import FittedMotion, place_joints, pose_motion
-from twofold.prepare.fitting.pose_files import poses_from_file
+from twofold.prepare.fitting.pose_files import OwnPoses, poses_from_file, with_lens
 from twofold.prepare.output.acceptance import LARGER, require_person
 from twofold.prepare.video.clips import Clip, PrepareConfig, advice
+from twofold.prepare.video.frames import describe
 from twofold.prepare.video.numbering import best_reading
 
 Find = Callable[[UInt8[np.ndarray, "h w 3"]], list[Person]]
@@ -36,11 +38,28 @@ class Given:
         landmarks: their own landmarks of every image of the clip, in words and pixels of undistorted images, for each
             way to read their numbers; the likeliest first.
         motion: their own poses, of every image of the clip.
+        absent: images without such a pose.
+        remarks: sentences about the poses.
     """
 
     masks: GivenMasks | None = None
     landmarks: tuple[tuple[str, Track], ...] = ()
     motion: FittedMotion | None = None
+    absent: tuple[int, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+
+def own_lens(clips: Sequence[Path], config: PrepareConfig, body: Body) -> PrepareConfig:
+    """The configuration with the lens that the user's own poses were estimated with, where no other was given.
+
+    Raises:
+        TwofoldError: the poses are damaged or do not go with the clip.
+    """
+    if config.poses is None or config.intrinsics is not None or config.calibration is not None or len(clips) > 1:
+        return config
+    info = describe(clips[0], config.fps, config.max_size)
+    lens = poses_from_file(config.poses, info, body, PoseOptions(config.track, config.smplx)).lens
+    return config if lens is None else replace(config, intrinsics=lens(info.full_width, info.full_height))
 
 
 def read_given(ready: Sequence[Clip], config: PrepareConfig, body: Body) -> list[Given]:
@@ -58,11 +77,21 @@ def read_given(ready: Sequence[Clip], config: PrepareConfig, body: Body) -> list
             place = _piece(config.landmarks, clip, len(ready))
             landmarks = [(words, _undistorted(track, clip)) for words, track in landmark_readings(place, clip.info)]
             require_person(landmarks[0][1], str(config.landmarks), advice(config, LARGER, ("landmarks",)))
-        motion = None
-        if config.poses is not None:
-            motion = poses_from_file(config.poses, ready[0].info, range(ready[0].info.sources), body)
-        found.append(Given(masks, tuple(landmarks or ()), motion))
+        poses = None if config.poses is None else _poses(config.poses, ready, config, body)
+        if poses is None:
+            found.append(Given(masks, tuple(landmarks or ())))
+        else:
+            said = poses.remarks if clip is ready[0] else ()
+            found.append(Given(masks, tuple(landmarks or ()), poses.motion, poses.absent, said))
     return found
+
+
+def _poses(path: Path, ready: Sequence[Clip], config: PrepareConfig, body: Body) -> OwnPoses:
+    """The user's own poses, for the camera that is taken."""
+    own = poses_from_file(path, ready[0].info, body, PoseOptions(config.track, config.smplx))
+    if own.lens is None or len(ready) > 1:
+        return own
+    return with_lens(own, ready[0].camera, own.lens, ready[0].info, body)
 
 
 def _piece(place: Path, clip: Clip, clips: int) -> Path:

@@ -32,7 +32,7 @@ from twofold.prepare.fitting.observations import Evidence
 from twofold.prepare.fitting.parameters import FittedMotion, choose, pose_motion, root_of
 from twofold.prepare.fitting.pose_files import motion_at
 from twofold.prepare.fitting.world_up import stand_upright, up_direction
-from twofold.prepare.given import Finder, Given, chosen_landmarks, chosen_masks, read_given, region_finder
+from twofold.prepare.given import Finder, Given, chosen_landmarks, chosen_masks, own_lens, read_given, region_finder
 from twofold.prepare.output.acceptance import (
     FARTHER,
     STEADIER,
@@ -140,9 +140,13 @@ def prepare(
         CaptureWriter(out, overwrite) as writer, plain_errors(out),
         tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.resolve().parent) as scratch,
     ):  # fmt: skip
+        config = own_lens(clips, config, body)
         ready = open_clips(clips, config)
         given = read_given(ready, config, body)
         watched, remarks = _watch_all(ready, given, Path(scratch), estimator, finder, body, config, progress)
+        remarks += [remark for piece in given for remark in piece.remarks]
+        without = [time for time, source in enumerate(watched[0].sources) if source in set(given[0].absent)]
+        config = replace(config, drop=tuple(sorted({*config.drop, *without})))
         chosen = any(piece is not None for piece in (config.person, config.masks, config.landmarks, config.poses))
         if people is not None and config.several_people == "refuse" and not chosen:
             for clip, seen in zip(ready, watched, strict=True):

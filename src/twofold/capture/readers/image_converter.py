@@ -42,11 +42,10 @@ class ImageConverter:
         height, width = size
         self._size = size
         bent = source.distortion
-        if bent is not None and largest_distortion(source.intrinsics, bent, height, width) > _LENS_MATTERS:
-            self._distortion = bent
-        else:
-            self._distortion = None
-        self._intrinsics = source.intrinsics
+        matters = bent is not None and largest_distortion(source.intrinsics, bent, height, width) > _LENS_MATTERS
+        self._straighten = (
+            image_undistorter(source.intrinsics, bent, height, width) if bent is not None and matters else None
+        )
         whole = Camera(
             torch.from_numpy(source.world_to_camera), torch.from_numpy(source.intrinsics.copy()), height, width
         )
@@ -68,9 +67,8 @@ class ImageConverter:
                 f"{image.where} has {colours.shape[1]} x {colours.shape[0]} pixels (its mask {mask.shape[1]} x "
                 f"{mask.shape[0]}), the camera's first image {self._size[1]} x {self._size[0]}; give all in one size."
             )
-        if self._distortion is not None:
-            straighten = image_undistorter(self._intrinsics, self._distortion, *self._size)
-            both = straighten(np.concatenate([colours, mask[..., None]], -1))
+        if self._straighten is not None:
+            both = self._straighten(np.concatenate([colours, mask[..., None]], -1))
             colours, mask = np.ascontiguousarray(both[..., :3]), np.ascontiguousarray(both[..., 3])
         rows, columns = self.camera.height, self.camera.width
         if (rows, columns) != self._size:

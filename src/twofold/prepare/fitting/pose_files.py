@@ -1,62 +1,126 @@
-"""Poses that the user has: of every image of a clip, relative to the T-pose of the body that is taken."""
+"""Poses that the user has, in a file of their own or as results of an estimator, as a motion of a clip's images."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.skeleton import Body
 from twofold.errors import TwofoldError
+from twofold.geometry.cameras import Camera
 from twofold.geometry.rotations import axis_angle_to_matrix
-from twofold.npz import are_moderate, read_npz
-from twofold.prepare.fitting.parameters import FittedMotion
+from twofold.prepare.estimators.estimates import (
+    Lens,
+    PersonTrack,
+    PoseOptions,
+    absent_words,
+    chosen_track,
+    places_of,
+)
+from twofold.prepare.estimators.known_estimators import placed, read_estimates
+from twofold.prepare.fitting.parameters import FittedMotion, root_of
 from twofold.prepare.video.frames import ClipInfo
 
-_PLACES = ("translations", "transl", "trans")
-_JOINTS = 24
+_VARYING = 0.3
+"""Betas that differ by more from image to image are worth a sentence."""
 
 
-def poses_from_file(path: Path | str, info: ClipInfo, sources: Sequence[int], body: Body) -> FittedMotion:
-    """A motion from an npz file with SMPL-like poses.
+@dataclass(frozen=True)
+class OwnPoses:
+    """A motion of every image of a clip.
+
+    Attributes:
+        motion: of every image; between images with poses it is that of the nearest one.
+        absent: images without a pose, by `VideoFrame.source`.
+        lens: the camera that the poses were estimated with; None where nothing says.
+        remarks: sentences for the user.
+    """
+
+    motion: FittedMotion
+    absent: tuple[int, ...]
+    lens: Lens | None
+    remarks: tuple[str, ...]
+
+
+def poses_from_file(path: Path | str, info: ClipInfo, body: Body, options: PoseOptions | None = None) -> OwnPoses:
+    """A motion from poses of SMPL's joints: see `known_estimators.ESTIMATORS` for the files.
 
     Args:
-        path: with `poses` (F x 24 x 3 or F x 72: axis-angle, root first, radians), `translations` (F x 3, metres; also
-            called `transl` or `trans`) and, if they are known, `betas`. One camera: in its axes (x right, y down, z
-            forward). Several: in the calibration's world.
-        info: of the clip; F is how many images it has.
-        sources: which of its images are used.
+        path: file or folder.
+        info: of the clip; images are matched by their names or numbers.
         body: whose joints these are.
+        options: whom of several people, and what else is needed.
 
     Raises:
-        TwofoldError: the file is missing or damaged, lacks an array, has other shapes, or belongs to another clip.
+        TwofoldError: the file is missing or damaged, of no known kind, of another body, or belongs to another clip.
     """
-    path = Path(path)
-    arrays = read_npz(path, ("poses", *_PLACES, "betas"))
-    poses = _finite(arrays, ("poses",), path)
-    places = _finite(arrays, _PLACES, path)
-    if poses.ndim < 2 or poses[0].size != 3 * _JOINTS:
+    options = options or PoseOptions()
+    found, placement = read_estimates(Path(path), options)
+    if found.smpl and body.name != "smpl":
         raise TwofoldError(
-            f"{path}: `poses` is {' x '.join(map(str, poses.shape))}, expected images x 24 x 3 (SMPL's joints)."
+            f"{path} has poses and shapes of SMPL, and the body is {body.name}; name your SMPL file with --body."
         )
-    frames = len(poses)
-    if places.shape != (frames, 3):
-        shape = " x ".join(map(str, places.shape))
-        raise TwofoldError(f"{path}: {frames} poses need translations of {frames} x 3; they are {shape}.")
-    if not info.sources <= frames <= info.sources + max(1, info.sources // 50):
+    track, people = chosen_track(found, options.track)
+    betas, words = _one_shape(track, body, path)
+    track, _ = chosen_track(placed(found, placement, root_of(body, betas)), options.track)
+    count = len(track.images)
+    if found.complete and not info.sources <= count <= info.sources + max(1, info.sources // 50):
         raise TwofoldError(
-            f"{path} has poses of {frames} images, and the clip has {info.sources}; give one for every image."
+            f"{path} has poses of {count} images, and the clip has {info.sources}; give one for every image."
         )
-    pose = torch.from_numpy(poses.reshape(frames, _JOINTS, 3)).float()
+    rows, assumed = places_of(track, found, info)
+    if not rows:
+        raise TwofoldError(f"{path} has no pose of any image of the clip; give the results for this clip.")
+    absent = tuple(source for source in range(info.sources) if source not in rows)
+    known = torch.tensor(sorted(rows))
+    nearest = known[(torch.arange(info.sources)[:, None] - known).abs().argmin(1)]
+    order = torch.tensor([rows[int(source)] for source in nearest])
+    pose = track.poses[order].float()
     motion = FittedMotion(
-        guess=axis_angle_to_matrix(pose[:, 0]), root=torch.zeros(frames, 3), pose=pose[:, 1:],
-        translation=torch.from_numpy(places).float(), betas=_betas(arrays, body, path),
+        guess=axis_angle_to_matrix(pose[:, 0]), root=torch.zeros(len(pose), 3), pose=pose[:, 1:],
+        translation=track.translations[order].float(), betas=betas.float(),
         marks=torch.zeros(33, 3), log_focal=torch.zeros(()), log_distance=torch.zeros(()),
     )  # fmt: skip
-    return motion_at(motion, sources)
+    remarks = (*found.remarks, people, words, assumed, absent_words(found, absent))
+    return OwnPoses(motion, absent, found.lens, tuple(filter(None, remarks)))
+
+
+def with_lens(own: OwnPoses, camera: Camera, lens: Lens, info: ClipInfo, body: Body) -> OwnPoses:
+    """Poses for another camera than they were estimated with: every pelvis keeps its place and size in the image.
+
+    Args:
+        own: as estimated.
+        camera: that is taken, of images of the clip's size.
+        lens: that they were estimated with.
+        info: of the clip.
+        body: whose joints these are.
+    """
+    across, down = info.width / info.full_width, info.height / info.full_height
+    fx, fy, cx, cy = lens(info.full_width, info.full_height)
+    fx, fy, cx, cy = fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
+    joint = root_of(body, own.motion.betas)
+    moved = refocused(own.motion.translation + joint, (fx, fy, cx, cy), camera.intrinsics) - joint
+    ratio = float(camera.intrinsics[0, 0]) / fx
+    words = () if abs(ratio - 1) < 1e-3 else (
+        f"The poses were estimated with a focal length of {fx:.0f} pixels; depths are scaled by {ratio:.3f} for yours.",
+    )  # fmt: skip
+    return replace(own, motion=replace(own.motion, translation=moved), remarks=(*own.remarks, *words))
+
+
+def refocused(
+    points: Float[Tensor, "n 3"], lens: tuple[float, float, float, float], intrinsics: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n 3"]:
+    """Points in a camera's axes moved so that another lens shows them at the same pixels and in the same size."""
+    fx, fy, cx, cy = lens
+    depth = points[:, 2] * float(intrinsics[0, 0]) / fx
+    column = fx * points[:, 0] / points[:, 2] + cx
+    row = fy * points[:, 1] / points[:, 2] + cy
+    x = (column - intrinsics[0, 2]) / intrinsics[0, 0] * depth
+    y = (row - intrinsics[1, 2]) / intrinsics[1, 1] * depth
+    return torch.stack([x, y, depth], -1)
 
 
 def motion_at(motion: FittedMotion, sources: Sequence[int]) -> FittedMotion:
@@ -68,24 +132,14 @@ def motion_at(motion: FittedMotion, sources: Sequence[int]) -> FittedMotion:
     )  # fmt: skip
 
 
-def _finite(arrays: dict[str, np.ndarray], names: Sequence[str], path: Path) -> np.ndarray:
-    found = [name for name in names if name in arrays]
-    if not found:
-        raise TwofoldError(f"{path} lacks the array `{names[0]}`; docs/prepare.md describes what belongs in it.")
-    values = arrays[found[0]]
-    if values.dtype.kind not in "fiu" or not are_moderate(values):
-        raise TwofoldError(f"{path}: `{found[0]}` holds something that is no finite number; estimate it again.")
-    return values
-
-
-def _betas(arrays: dict[str, np.ndarray], body: Body, path: Path) -> Float[Tensor, "S"]:
-    """The shape coefficients given, filled up with zeros to as many as the body has."""
+def _one_shape(track: PersonTrack, body: Body, path: Path | str) -> tuple[Float[Tensor, "S"], str]:
+    """The mean shape, filled up with zeros to as many coefficients as the body has, and a sentence where it varies."""
     betas = torch.zeros(body.shape_basis.shape[-1])
-    if "betas" not in arrays:
-        return betas
-    given = np.atleast_2d(_finite(arrays, ("betas",), path).astype(np.float32))
-    if (given != given[0]).any():
-        raise TwofoldError(f"{path}: `betas` changes from image to image; a person has one shape, give its mean.")
-    count = min(len(betas), given.shape[1])
-    betas[:count] = torch.from_numpy(given[0, :count])
-    return betas
+    count = min(len(betas), track.betas.shape[1])
+    if not count:
+        return betas, ""
+    betas[:count] = track.betas.mean(0)[:count].float()
+    off = float((track.betas - track.betas.mean(0)).abs().max())
+    if off <= _VARYING:
+        return betas, ""
+    return betas, f"betas in {path} differ from image to image by up to {off:.2f}; a person has one shape, their mean."

@@ -53,6 +53,8 @@ class PrepareConfig:
         masks: the user's own, instead of the estimator's.
         landmarks: likewise.
         poses: likewise; nothing is fitted then.
+        track: whom of several people in these poses; None for who is seen longest.
+        smplx: the user's SMPL-X file, where these poses are of that model.
         several_people: whether a second person in view ends it.
         person: which of several people is meant; None for whom the user's own masks, landmarks or poses show, else for
             the only one.
@@ -71,6 +73,8 @@ class PrepareConfig:
     masks: Path | None = None
     landmarks: Path | None = None
     poses: Path | None = None
+    track: int | None = None
+    smplx: Path | None = None
     several_people: Literal["refuse", "ignore"] = "refuse"
     person: Choice | None = None
     drop: tuple[int, ...] = ()
@@ -199,6 +203,8 @@ def require_options(clips: Sequence[Path], config: PrepareConfig) -> None:
         raise TwofoldError("--person masks takes the person in your own masks; give them with --masks, too.")
     if isinstance(config.person, int) and config.person < 1:
         raise TwofoldError(f"--person counts people from the left, from 1; it is {config.person}.")
+    if config.poses is None and (config.track is not None or config.smplx is not None):
+        raise TwofoldError("--track and --smplx belong to the results of a pose estimator; give these with --poses.")
     if config.held_out < 3:
         raise TwofoldError(f"One frame of {config.held_out} cannot be held out between two that train; take 3 or more.")
 
