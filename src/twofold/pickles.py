@@ -27,7 +27,7 @@ NUMPY = (
 )
 """What arrays and numbers are made with."""
 CONTAINERS = (
-    r"(__builtin__|builtins)\.(object|set|frozenset|dict|list|tuple|bytearray|slice)"
+    r"(__builtin__|builtins)\.(object|set|frozenset|dict|list|tuple|bytes|bytearray|slice)"
     r"|collections\.(OrderedDict|defaultdict)"
 )
 _PLAIN = re.compile(f"{NUMPY}|{CONTAINERS}")
@@ -239,6 +239,8 @@ def _raw_bytes(value: object) -> bytes:
     """Bytes as Python 2 wrote them (read as latin-1 text), as Python 3 writes them for it, or plain."""
     if isinstance(value, Record) and value.origin == "_codecs.encode" and value.arguments[1:] == ("latin1",):
         value = value.arguments[0]
+    if isinstance(value, Record) and value.origin.endswith(".bytes") and not value.arguments:
+        return b""  # as protocol 2 has it
     if isinstance(value, str):
         return value.encode("latin1")
     if isinstance(value, bytes | bytearray):

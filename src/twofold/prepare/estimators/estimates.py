@@ -17,7 +17,7 @@ from twofold.geometry.rotations import matrix_to_axis_angle
 from twofold.prepare.video.frames import ClipInfo
 
 Lens = Callable[[int, int], tuple[float, float, float, float]]
-"""fx, fy, cx, cy in pixels for images of so many columns and rows."""
+"""fx, fy, cx, cy in pixels, for images with that width and height."""
 _JUMP = 0.7
 """Metres: a person found farther from where one was in the image before is somebody else."""
 
