@@ -32,7 +32,7 @@ MISSING = "\N{EN DASH}"
 
 
 @dataclass(frozen=True)
-class Column:
+class ComparedMetric:
     """A column of the table.
 
     Attributes:
@@ -49,18 +49,18 @@ class Column:
 
 
 COLUMNS = (
-    Column("novel view: box PSNR, dB", "novel_view", "psnr_box", max),
-    Column("novel view: box SSIM", "novel_view", "ssim_box", max),
-    Column("novel view: silhouette IoU", "novel_view", "silhouette_iou", max),
-    Column("novel pose: box PSNR, dB", "novel_pose", "psnr_box", max),
-    Column("novel pose: box SSIM", "novel_pose", "ssim_box", max),
-    Column("novel pose: silhouette IoU", "novel_pose", "silhouette_iou", max),
-    Column("Chamfer distance, cm", "geometry", "chamfer_cm", min),
-    Column("parameters", "cost", "parameters"),
-    Column("training, s", "cost", "training_seconds"),
-    Column("training, s of a processor", "cost", "training_processor_seconds"),
-    Column("an image, s", "cost", "frame_seconds"),
-    Column("an image, s of a processor", "cost", "frame_processor_seconds"),
+    ComparedMetric("novel view: box PSNR, dB", "novel_view", "psnr_box", max),
+    ComparedMetric("novel view: box SSIM", "novel_view", "ssim_box", max),
+    ComparedMetric("novel view: silhouette IoU", "novel_view", "silhouette_iou", max),
+    ComparedMetric("novel pose: box PSNR, dB", "novel_pose", "psnr_box", max),
+    ComparedMetric("novel pose: box SSIM", "novel_pose", "ssim_box", max),
+    ComparedMetric("novel pose: silhouette IoU", "novel_pose", "silhouette_iou", max),
+    ComparedMetric("Chamfer distance, cm", "geometry", "chamfer_cm", min),
+    ComparedMetric("parameters", "cost", "parameters"),
+    ComparedMetric("training, s", "cost", "training_seconds"),
+    ComparedMetric("training, s of a processor", "cost", "training_processor_seconds"),
+    ComparedMetric("an image, s", "cost", "frame_seconds"),
+    ComparedMetric("an image, s of a processor", "cost", "frame_processor_seconds"),
 )
 """Beside run, recipe and steps; a column that no run has is left out."""
 
@@ -242,7 +242,7 @@ def comparison_table(runs: Sequence[ComparedRun]) -> Table:
     return Table(("run", "recipe", "steps", *(c.title for c in columns)), tuple(tuple(line) for line in cells))
 
 
-def _value(run: ComparedRun, column: Column) -> float | int | None:
+def _value(run: ComparedRun, column: ComparedMetric) -> float | int | None:
     value = run.metrics.get(column.section, {}).get(column.name)
     return value if isinstance(value, float | int) else None
 
