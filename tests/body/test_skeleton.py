@@ -8,6 +8,7 @@ import scipy.spatial.transform
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from little_body import little_body
 
 from twofold.body.skeleton import (
     JOINT_NAMES,
@@ -16,6 +17,7 @@ from twofold.body.skeleton import (
     canonical_pose,
     joint_transforms,
     joint_transforms_of_rotations,
+    movements,
     pose_body,
     shape_body,
     skin,
@@ -257,3 +259,14 @@ def test_rotation_matrices_pose_the_joints_as_their_axis_angles_do():
     translation = torch.rand(3, generator=generator)
     matrices = joint_transforms_of_rotations(joints, axis_angle_to_matrix(pose), translation)
     assert torch.equal(matrices, joint_transforms(joints, pose, translation))
+
+
+def test_movement_is_the_largest_way_of_a_vertex():
+    body = little_body()
+    shaped = shape_body(body, torch.zeros(body.shape_basis.shape[-1]))
+    generator = torch.Generator().manual_seed(2)
+    pose, translation = 0.3 * torch.randn(2, 3, 24, 3, generator=generator), torch.randn(2, 3, 3, generator=generator)
+    found = movements(shaped, (pose[0], translation[0]), (pose[1], translation[1]), every=1)
+    for n in range(3):
+        first, second = (pose_body(shaped, pose[i, n], translation[i, n]).vertices for i in (0, 1))
+        torch.testing.assert_close(found[n], (first - second).norm(dim=-1).max())

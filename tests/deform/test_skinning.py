@@ -225,3 +225,16 @@ def test_mapping_once_has_the_values_and_the_pose_gradient_of_mapping_again(k):
     with torch.no_grad():
         plain = with_pose_gradient(x_canonical, inverse, nearest, weights, once)
     assert not plain[0].requires_grad
+
+
+@pytest.mark.parametrize("k", [1, 6])
+def test_compiled_form_is_its_twin_in_double_precision(body, k):
+    points = near_the_body(body, 500).float()
+    squared, nearest = torch.cdist(points, body.vertices.float()).square().topk(k, largest=False)
+    weights, twin = smooth_neighbour_weights(squared), smooth_neighbour_weights(squared.double())
+    torch.testing.assert_close(weights.double(), twin, atol=1e-6, rtol=1e-4)
+    forward = vertex_transforms(body).float()
+    found = map_to_canonical(points, nearest, weights, forward)
+    expected = map_to_canonical(points.double(), nearest, weights.double(), forward.double())
+    for single, double in zip(found, expected, strict=True):
+        torch.testing.assert_close(single.double(), double, atol=1e-5, rtol=1e-4)

@@ -101,6 +101,30 @@ def test_shells_follow_corrections_only_at_a_refresh_and_then_with_the_shape(sub
     torch.testing.assert_close(after.own.surface.shell.vertices, after.body.vertices.detach(), rtol=0, atol=1e-6)
 
 
+def test_shells_are_built_anew_only_for_bodies_that_left_their_margin(subject, person):
+    avatar = replace(QUICK, shell_refresh=10).build(subject)
+    near, far = person.train[1].frame_index, person.train[2].frame_index
+    before = [pose_of(avatar, person, time=time, step=8).own.surface.shell for time in (near, far)]
+    with torch.no_grad():
+        avatar.refinement.translation[avatar.refinement.rows[near]] = torch.tensor([0.0024, 0, 0])
+        avatar.refinement.translation[avatar.refinement.rows[far]] = torch.tensor([0.0026, 0, 0])
+    avatar.before_step(Mode(10))
+    after = [pose_of(avatar, person, time=time, step=10) for time in (near, far)]
+    assert after[0].own.surface.shell is before[0]
+    assert after[1].own.surface.shell is not before[1]
+    # Samples are measured against the body as it is now, whatever its shell was built from.
+    frame = person.train[1]
+    rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
+    placed = avatar._sampler.candidates(rays, after[0].own.surface, None)
+    away = torch.cdist(placed.samples.points(rays), after[0].body.vertices.detach()).amin(1)
+    assert 0.055 < float(away.max()) < 0.0601
+    resumed = replace(QUICK, shell_refresh=10).build(subject, 1)
+    resumed.load_state_dict(avatar.state_dict())
+    for time, posed in zip((near, far), after, strict=True):
+        again = pose_of(resumed, person, time=time, step=11).own.surface.shell
+        assert torch.equal(again.nearest, posed.own.surface.shell.nearest)
+
+
 def trained_with(trained, **options):
     """The trained tiny avatar with other options of its method."""
     avatar, _ = load(trained.folder)

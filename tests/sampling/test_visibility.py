@@ -32,6 +32,22 @@ def test_following_rays_from_the_front_finds_the_samples_that_count(least: float
     assert asked.sum() < len(depth)
 
 
+def test_compiled_bookkeeping_is_that_of_the_twin() -> None:
+    samples, density = packed([3, 0, 60, 25, 1], 4)
+    double = Samples(samples.ray_index, samples.depth.double(), samples.delta.double())
+    asked: list[list[int]] = []
+
+    def answer(index: Tensor) -> Tensor:
+        asked.append(sorted(index.tolist()))
+        return density[index]
+
+    first = seen_samples(samples, answer, 5, 0.01)
+    stretches, asked = asked, []
+    second = seen_samples(double, lambda index: answer(index).double(), 5, 0.01)
+    assert torch.equal(first, second)
+    assert stretches == asked
+
+
 @given(counts=COUNTS, seed=st.integers(0, 1000), doubt=st.floats(0, 1), least=st.sampled_from([1e-3, 0.05, 0.3]))
 def test_samples_that_count_are_possible_however_little_is_known_of_the_densities(counts, seed, doubt, least):
     samples, density = packed(counts, seed)

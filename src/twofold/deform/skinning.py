@@ -7,6 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from twofold.body.skeleton import PosedBody
+from twofold.deform import skinning_kernels as kernels
+from twofold.kernels.parallel import in_parts
 from twofold.kernels.sparse_rows import scatter_rows, weighted_rows
 
 
@@ -88,6 +90,11 @@ def smooth_neighbour_weights(squared_distances: Float[Tensor, "S K"]) -> Float[T
     >>> smooth_neighbour_weights(torch.tensor([[0.0, 0.5, 1.0]]))
     tensor([[8.0000e-01, 2.0000e-01, 8.0000e-07]])
     """
+    if _compiled(squared_distances):
+        weights = torch.empty_like(squared_distances)
+        given = (squared_distances.detach().contiguous().numpy(), weights.numpy())
+        in_parts(len(weights), lambda begin, end: kernels.smooth_weights(*given, begin, end))
+        return weights
     farthest = squared_distances.amax(-1, keepdim=True)
     raw = (1 - squared_distances / farthest.clamp_min(1e-12)).square() + 1e-6
     return raw / raw.sum(-1, keepdim=True)
@@ -162,9 +169,21 @@ def map_to_canonical(
     >>> x_c, inverse[0, 0, [0, 3]]
     (tensor([[2., 0., 0.]]), tensor([ 0.5000, -0.5000]))
     """
+    if _compiled(x_posed, weights, forward):
+        x_canonical, rows = torch.empty_like(x_posed), torch.empty(len(x_posed), 3, 4)
+        given = (t.detach().contiguous().numpy() for t in (x_posed, nearest, weights, forward))
+        arrays = (*given, x_canonical.numpy(), rows.numpy())
+        in_parts(len(x_posed), lambda begin, end: kernels.map_points(*arrays, begin, end))
+        return x_canonical, rows
     rows = _inverse_rows(nearest, weights, forward)
     # A product of the whole batch with elementwise sums: batched 3x3 matrix products are slow on CPUs.
     return (rows[..., :3] * x_posed[:, None, :]).sum(-1) + rows[..., 3], rows
+
+
+def _compiled(*tensors: Tensor) -> bool:
+    """Whether the compiled form can be used: single precision on a CPU, without gradients."""
+    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    return not wanted and all(t.dtype == torch.float32 and not t.is_cuda and t.ndim > 1 for t in tensors)
 
 
 class _WithPoseGradient(torch.autograd.Function):

@@ -9,7 +9,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -364,7 +364,7 @@ class _BoneLookup(torch.autograd.Function):
             return by_points
 
         # Bones own their channels and rows; what they add to the points is summed at the end.
-        by_points = cast(list[Tensor], in_parts(len(rows), part, 1))
+        by_points = in_parts(len(rows), part, 1)
         return by_weights, torch.stack(by_points).sum(0), by_rows
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from twofold.body.skeleton import PosedBody, ShapedBody, pose_body, shape_body
+from twofold.body.skeleton import PosedBody, ShapedBody, movements, pose_body, shape_body
 from twofold.config import require
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.deform.skinning import normal_matrices, to_canonical, vertex_transforms, weights_by
@@ -106,6 +106,11 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         """See `Avatar.ray_margin`."""
         return self.config.sampler.reach + 0.02
 
+    @property
+    def reach(self) -> float:
+        """See `Avatar.reach`: as far as samples are placed and count."""
+        return min(self.config.sampler.reach, self.deformation.outlier_distance)
+
     def scalars(self) -> dict[str, float]:
         """See `Avatar.scalars`: the scale of the density."""
         return {"beta": float(self.beta.detach())}
@@ -128,12 +133,30 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         if not self.refinement.parts or step == 0 or step % refresh or step < self.config.pose.refine_from:
             return
         with torch.no_grad():
-            for row, time in enumerate(self.subject.times):
-                pose, translation = self.subject.poses[row], self.subject.translations[row]
-                pose, translation = self.refinement(int(time), pose.to(self.device), translation.to(self.device))
-                self.shell_poses[row], self.shell_translations[row] = pose, translation
+            self._follow(*self._refined())
+
+    def _refined(self) -> tuple[Tensor, Tensor]:
+        """Poses and translations of all training frames with their corrections."""
+        found = [
+            self.refinement(int(time), pose.to(self.device), translation.to(self.device))
+            for time, pose, translation in zip(
+                self.subject.times, self.subject.poses, self.subject.translations, strict=True
+            )
+        ]
+        return torch.stack([pose for pose, _ in found]), torch.stack([translation for _, translation in found])
+
+    def _follow(self, poses: Tensor, translations: Tensor) -> None:
+        """Gives up the shells of bodies that have moved by more than `SHELL_MARGIN`, half of it left to the shape."""
+        allowed = SHELL_MARGIN / 2
+        old, new = self._shape(self.shell_shape), self._shape(self.refinement.shape)
+        if float((old.vertices - new.vertices).norm(dim=-1).max()) > allowed:
+            moved = torch.ones(len(poses), dtype=torch.bool)
             self.shell_shape.copy_(self.refinement.shape)
-        self._shells.clear()
+        else:
+            moved = movements(old, (self.shell_poses, self.shell_translations), (poses, translations)) > allowed
+        for row in moved.nonzero()[:, 0].tolist():
+            self.shell_poses[row], self.shell_translations[row] = poses[row], translations[row]
+            self._shells.pop(row, None)
 
     def pose(
         self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], frame_index: int | None = None,
@@ -209,6 +232,8 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
             with torch.no_grad():
                 shaped = self._shape(self.shell_shape)
                 start = pose_body(shaped, self.shell_poses[row], self.shell_translations[row])
+            if len(self._shells) >= SHELLS_KEPT:
+                self._shells.pop(next(iter(self._shells)))
             self._shells[row] = sampler.shell(start.vertices, body.faces, neighbours)
         shell = self._shells[row]
         return lambda: shell
@@ -320,6 +345,11 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         return x_canonical, self._normal_matrices(x_canonical, by_posed, posed)
 
 
+SHELL_MARGIN = 0.005
+"""How far a body may move before its shell is built anew, metres: a quarter of a voxel. Until then samples are measured
+against the moved body; only at the shell's rim, centimetres from the body, some are missed."""
+SHELLS_KEPT = 512
+"""Shells of training frames that are kept, of two or three megabytes each; the one made first gives way."""
 _BETA_UNIT = 0.01
 """Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""
 

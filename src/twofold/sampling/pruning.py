@@ -5,12 +5,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from twofold.geometry.cameras import Rays
+from twofold.kernels.parallel import in_parts
+from twofold.sampling import shell_kernels
 from twofold.sampling.placement import Distance, Placement
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.sdf_grid import SdfGrid
 from twofold.sampling.shell import Shell, nearest_listed
 from twofold.sampling.visibility import possible_samples, seen_samples
 from twofold.volume.rendering import laplace_density
+from twofold.volume.samples import Samples
 
 
 @torch.no_grad()
@@ -23,7 +26,15 @@ def miswarped(
     head. So a sample that comes closer to the canonical body than it was to the posed one, by more than `slack` metres,
     is mis-warped.
     """
-    away = (placed.samples.points(rays) - surface.body.vertices[placed.nearest[:, 0]]).norm(dim=-1)
+    points = placed.samples.points(rays)
+    if not points.is_cuda and points.dtype == torch.float32:
+        wrong = torch.empty(len(points), dtype=torch.bool)
+        given = (points, placed.x_canonical, placed.nearest[:, 0], surface.body.vertices.detach(), canonical.low)
+        lists = (canonical.row.numpy(), canonical.nearest.numpy(), canonical.vertices.numpy())
+        arrays = (*(tensor.contiguous().numpy() for tensor in given), canonical.voxel, *lists, slack, wrong.numpy())
+        in_parts(len(points), lambda begin, end: shell_kernels.miswarped(*arrays, begin, end))
+        return wrong
+    away = (points - surface.body.vertices[placed.nearest[:, 0]]).norm(dim=-1)
     rows = canonical.rows_at(placed.x_canonical)
     near = ((away > slack) & (rows >= 0)).nonzero()[:, 0]
     _, squared = nearest_listed(canonical, placed.x_canonical[near], rows[near], 1)
@@ -34,27 +45,27 @@ def miswarped(
 
 @torch.no_grad()
 def visible(
-    placed: Placement, rays: int, distance: Distance, beta: Float[Tensor, ""], min_weight: float,
-    grid: SdfGrid | None = None,
+    samples: Samples, x_canonical: Float[Tensor, "S 3"], rays: int, distance: Distance, beta: Float[Tensor, ""],
+    min_weight: float, grid: SdfGrid | None = None,
 ) -> Int[Tensor, "n"]:  # fmt: skip
     """Which of the samples add more than `min_weight` to their pixel.
 
     Args:
-        placed: all samples.
+        samples: all of them.
+        x_canonical: where these are in canonical space, metres.
         rays: how many these lie on.
         distance: of the field, metres.
         beta: scale of the density, metres.
         min_weight: a weight (`composite_weights`).
         grid: of the same field in the same pose; what it shows to be empty or hidden is not queried.
     """
-    x_canonical = placed.x_canonical
     queried = torch.arange(len(x_canonical), device=x_canonical.device)
     if grid is not None:
         nearer, further = grid.bounds(x_canonical)
         largest, smallest = laplace_density(nearer, beta), laplace_density(further, beta)
-        queried = possible_samples(placed.samples, smallest, largest, min_weight).nonzero()[:, 0]
+        queried = possible_samples(samples, smallest, largest, min_weight).nonzero()[:, 0]
 
     def density(index: Tensor) -> Tensor:
-        return laplace_density(distance(x_canonical[queried[index]]), beta)
+        return laplace_density(distance(x_canonical[index if grid is None else queried[index]]), beta)
 
-    return queried[seen_samples(placed.samples[queried], density, rays, min_weight)]
+    return queried[seen_samples(samples if grid is None else samples[queried], density, rays, min_weight)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from torch import Tensor
 
@@ -96,10 +96,9 @@ def build_shell(
     reach = radius / voxel + np.sqrt(3)
     near = np.argwhere(away <= reach)
     centers = (low + (near + 0.5) * voxel).astype(np.float32)
-    tree = search_tree(points, quick=True)
-    listed = min(candidates, len(points))
-    distance, index = query_nearest(tree, centers, listed)
-    keep = distance[:, 0] <= radius + np.sqrt(3) / 2 * voxel
+    limit = radius + np.sqrt(3) / 2 * voxel
+    distance, index = _listed(points, low, voxel, limit, away <= reach, centers, min(candidates, len(points)))
+    keep = distance[:, 0] <= limit
     row = -1 - np.maximum(away - reach, 0).astype(np.int32)
     row[tuple(near[keep].T)] = np.arange(keep.sum(), dtype=np.int32)
     device = vertices.device
@@ -111,6 +110,28 @@ def build_shell(
         nearest=torch.as_tensor(index[keep].astype(np.int32), device=device),
         vertices=vertices.detach().float(),
     )
+
+
+def _listed(
+    points: Float[np.ndarray, "V 3"], low: Float[np.ndarray, "3"], voxel: float, limit: float,
+    near: Bool[np.ndarray, "X Y Z"], centers: Float[np.ndarray, "N 3"], count: int,
+) -> tuple[Float[np.ndarray, "N C"], Int[np.ndarray, "N C"]]:  # fmt: skip
+    """Distances of the `count` vertices nearest to voxels' centres, and which these are, nearest first.
+
+    A search tree answers for each voxel apart. It is quicker to let each vertex offer itself to the voxels nearby, and
+    to ask the tree only where that leaves a list short.
+    """
+    rows = np.where(near, np.cumsum(near, dtype=np.int32).reshape(near.shape) - 1, -1).astype(np.int32)
+    index = np.zeros((len(centers), count), np.int32)
+    squares = np.full((len(centers), count), np.inf, np.float32)
+    given = (points, low.astype(np.float32), voxel, limit + voxel / 2, rows, index, squares)
+    in_parts(near.shape[0], lambda begin, end: shell_kernels.list_vertices(*given, begin, end), least=8)
+    # Voxels without any vertex within the limit are no part of the shell.
+    short = np.nonzero(np.isinf(squares[:, -1]) & (squares[:, 0] <= (limit + voxel / 2) ** 2))[0]
+    distance = np.sqrt(squares)
+    if len(short):
+        distance[short], index[short] = query_nearest(search_tree(points, quick=True), centers[short], count)
+    return distance, index
 
 
 def nearest_listed(
@@ -142,8 +163,8 @@ def nearest_listed(
 
 
 def sample_shell(
-    shell: Shell, rays: Rays, step: float, generator: torch.Generator | None, limit: float
-) -> tuple[Samples, Int[Tensor, "S 1"], Float[Tensor, "S 1"]]:
+    shell: Shell, rays: Rays, step: float, generator: torch.Generator | None, limit: float, k: int = 1
+) -> tuple[Samples, Int[Tensor, "S k"], Float[Tensor, "S k"]]:
     r"""Samples every `step` metres along each ray, kept only within `limit` of the body.
 
     \[ t_i = t_n + (i + u) h, \qquad \min_v \lVert o + t_i d - v \rVert < r, \qquad \delta_i = h \]
@@ -163,9 +184,10 @@ def sample_shell(
         step: metres.
         generator: shifts each ray's evenly spaced samples by a random part of a step; None puts samples at mid-step.
         limit: largest distance to the nearest vertex, metres, at most the shell's radius.
+        k: how many nearest vertices are wanted, at most as many as a voxel lists.
 
     Returns:
-        packed samples, the nearest vertex of each, and its squared distance (metres squared).
+        packed samples, the nearest listed vertices of each, and their squared distances (metres squared).
     """
     clipped, hit = clip_to_box(rays, shell.low, shell.high)
     ray_ids = hit.nonzero()[:, 0]
@@ -176,27 +198,26 @@ def sample_shell(
     clipped, start = clipped[ray_ids], start[ray_ids]
     if len(ray_ids) == 0:
         none = torch.zeros(0, device=device)
-        return Samples(ray_ids, none, none), ray_ids[:, None], none[:, None]
+        return Samples(ray_ids, none, none), ray_ids[:, None].expand(0, k), none[:, None].expand(0, k)
     find = _walk_in_torch if device.type != "cpu" or rays.origins.dtype != torch.float32 else _walk_compiled
-    ray, depth, nearest, squared = find(shell, clipped, start, step, limit)
-    samples = Samples(ray_ids[ray], depth, torch.full_like(depth, step))
-    return samples, nearest[:, None], squared[:, None]
+    ray, depth, nearest, squared = find(shell, clipped, start, step, limit, k)
+    return Samples(ray_ids[ray], depth, torch.full_like(depth, step)), nearest, squared
 
 
 def _walk_compiled(
-    shell: Shell, rays: Rays, start: Tensor, step: float, limit: float
+    shell: Shell, rays: Rays, start: Tensor, step: float, limit: float, k: int = 1
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     arrays = (t.contiguous().numpy() for t in (rays.origins, rays.directions, rays.near, rays.far, start))
     origins, directions, near, far, first = arrays
     given = (origins, directions, near, far, first, np.float32(step), shell.low.numpy(), shell.voxel, shell.row.numpy())
-    more = (shell.nearest.numpy(), shell.vertices.numpy(), limit)
+    more = (shell.nearest.numpy(), shell.vertices.numpy(), limit, min(k, shell.nearest.shape[1]))
     parts = in_parts(len(rays), lambda begin, end: shell_kernels.walk(*given, *more, begin, end), least=64)
     ray, depth, nearest, squared = (torch.from_numpy(np.concatenate(part)) for part in zip(*parts, strict=True))  # type: ignore[misc]
     return ray, depth, nearest, squared
 
 
 def _walk_in_torch(
-    shell: Shell, rays: Rays, start: Tensor, step: float, limit: float
+    shell: Shell, rays: Rays, start: Tensor, step: float, limit: float, k: int = 1
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The same as `_walk_compiled`, for GPUs and as its slow twin."""
     longest = int(((rays.far - rays.near) / step).max().ceil())
@@ -205,6 +226,6 @@ def _walk_in_torch(
     points = rays.origins[:, None] + depth[..., None] * rays.directions[:, None]
     rows = shell.rows_at(points)
     ray, position = ((rows >= 0) & (depth < rays.far[:, None])).nonzero(as_tuple=True)
-    nearest, squared = nearest_listed(shell, points[ray, position], rows[ray, position], 1)
+    nearest, squared = nearest_listed(shell, points[ray, position], rows[ray, position], k)
     close = squared[:, 0] < limit**2
-    return ray[close], depth[ray, position][close], nearest[close, 0], squared[close, 0]
+    return ray[close], depth[ray, position][close], nearest[close], squared[close]

@@ -1,7 +1,7 @@
 """The shell sampler: samples near the posed body only, and of these only the ones that can be seen."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -14,7 +14,7 @@ from twofold.sampling.placement import Deformation, FieldQuery, Placement, place
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.pruning import miswarped, visible
 from twofold.sampling.sdf_grid import SdfGrid, tabulate
-from twofold.sampling.shell import Shell, build_shell, nearest_listed, sample_shell
+from twofold.sampling.shell import Shell, build_shell, sample_shell
 
 _GRID_PAYS = 150_000
 """Samples from which on an SDF grid at 15 mm, of some eighty thousand nodes, is the quicker way."""
@@ -88,26 +88,26 @@ class ShellPlacer:
         placed = self.candidates(rays, surface, generator)
         if len(placed.samples) == 0:
             return placed
-        config = self.config
+        config, kept = self.config, None
         if config.miswarp_slack > 0:
             shell = self.canonical_shell(surface.forward.device)
-            placed = placed[(~miswarped(placed, rays, surface, shell, config.miswarp_slack)).nonzero()[:, 0]]
+            kept = (~miswarped(placed, rays, surface, shell, config.miswarp_slack)).nonzero()[:, 0]
         if config.min_weight > 0:
-            grid = None if training else self._grid(len(placed.samples), surface, query)
-            kept = visible(placed, len(rays), query.distance, query.beta, config.min_weight, grid)
-            placed = placed[kept]
-        return placed
+            left = placed.samples if kept is None else placed.samples[kept]
+            x_canonical = placed.x_canonical if kept is None else placed.x_canonical[kept]
+            grid = None if training else self._grid(len(left), surface, query)
+            seen = visible(left, x_canonical, len(rays), query.distance, query.beta, config.min_weight, grid)
+            kept = seen if kept is None else kept[seen]
+        return placed if kept is None else placed[kept]
 
     @torch.no_grad()
     def candidates(self, rays: Rays, surface: PosedSurface, generator: torch.Generator | None) -> Placement:
         """Every sample of the rays in the shell; a generator jitters each ray's evenly spaced samples together."""
         deformation = self.deformation
         limit = min(self.config.radius, deformation.outlier_distance)
-        samples, nearest, squared = sample_shell(surface.shell, rays, self.config.step, generator, limit)
-        if surface.neighbours > 1 and len(samples):
-            points = samples.points(rays)
-            rows = surface.shell.rows_at(points)
-            nearest, squared = nearest_listed(surface.shell, points, rows, surface.neighbours)
+        # A shell may have been built before the body's last small corrections.
+        shell, step = replace(surface.shell, vertices=surface.body.vertices.detach()), self.config.step
+        samples, nearest, squared = sample_shell(shell, rays, step, generator, limit, surface.neighbours)
         outlier = torch.zeros(len(samples), dtype=torch.bool, device=squared.device)
         return placement(samples, rays, nearest, deformation.weigh(squared), outlier, surface)
 

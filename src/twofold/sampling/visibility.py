@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from twofold.sampling import visibility_kernels as kernels
 from twofold.volume.rendering import composite_weights, optical_depth
 from twofold.volume.samples import Samples
 
@@ -54,6 +56,8 @@ def seen_samples(
         least: smallest weight (`composite_weights`) that counts.
         first: samples a ray is followed by at first; each further stretch is half as long again.
     """
+    if not samples.depth.is_cuda and samples.depth.dtype == torch.float32:
+        return _seen_compiled(samples, density, rays, least, first)
     count = len(samples)
     device = samples.depth.device
     order = torch.arange(count, device=device)
@@ -63,7 +67,7 @@ def seen_samples(
     begins = torch.cummax(torch.where(new, order, begins), 0).values
     rank = order - begins
     seen = torch.zeros(count, dtype=torch.bool, device=device)
-    through = torch.ones(rays, device=device)
+    through = torch.ones(rays, dtype=samples.depth.dtype, device=device)
     start, length, last = 0, first, int(rank.max()) if count else -1
     while start <= last:
         stretch = (rank >= start) & (rank < start + length) & (through > least)[samples.ray_index]
@@ -77,3 +81,21 @@ def seen_samples(
             through = through * torch.exp(-optical)
         start, length = start + length, length + length // 2
     return seen
+
+
+def _seen_compiled(
+    samples: Samples, density: Callable[[Tensor], Tensor], rays: int, least: float, length: int
+) -> Tensor:
+    """`seen_samples` with compiled bookkeeping; the densities are still asked for stretch by stretch."""
+    ray_index, delta = samples.ray_index.contiguous().numpy(), samples.delta.contiguous().numpy()
+    first = np.searchsorted(ray_index, np.arange(rays + 1))
+    through, seen = np.ones(rays, np.float32), np.zeros(len(ray_index), dtype=bool)
+    index, start, last = np.empty(len(ray_index), np.int64), 0, int(np.diff(first).max(initial=0))
+    limit = np.float32(least)
+    while start < last:
+        # Rays are in the order of their samples, so a stretch is too.
+        count = kernels.next_stretch(first, through, start, length, limit, index)
+        found = density(torch.from_numpy(index[:count])).float().contiguous().numpy()
+        kernels.follow(index[:count], ray_index, delta, found, through, limit, seen)
+        start, length = start + length, length + length // 2
+    return torch.from_numpy(seen)
