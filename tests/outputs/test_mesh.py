@@ -1,11 +1,15 @@
 """Surfaces posed by a body whose motion is known."""
 
+import pytest
 import torch
+from little_body import posed_little_body
 from torch import Tensor
 
 from twofold.body.skeleton import JOINT_NAMES, PosedBody, ShapedBody, canonical_pose, pose_body
+from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_transform
-from twofold.outputs.mesh import pose_surface
+from twofold.methods.base import Avatar, PosedAvatar
+from twofold.outputs.mesh import pose_surface, posed_surface
 
 
 def small_body(seed: int = 0, joints_each: int = 2) -> ShapedBody:
@@ -64,3 +68,29 @@ def test_neighbours_share_by_the_exponential_of_their_squared_distance() -> None
     transform = (weights[:, None, None] * body.bones).sum(0)
     expected = transform[:3, :3] @ point[0] + transform[:3, 3]
     assert torch.allclose(pose_surface(point, body)[0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("reach", [0.1, 0.02])
+def test_no_surface_is_taken_from_where_samples_are_never_placed(reach: float) -> None:
+    body = posed_little_body()
+
+    class Balloon(Avatar[None]):
+        """The body, eight centimetres thicker."""
+
+        pose = render = losses = parameter_groups = None  # type: ignore[assignment]
+        device = torch.device("cpu")  # type: ignore[assignment]
+
+        @property
+        def reach(self) -> float:
+            return reach
+
+        def level(self, x: Tensor, posed: object, branch: str = "full") -> Tensor:
+            return torch.cdist(x, body.canonical_vertices).amin(1) - 0.08
+
+    avatar = Balloon()
+    if reach < 0.08:
+        with pytest.raises(TwofoldError, match="within 2 cm"):
+            posed_surface(avatar, PosedAvatar(body, None), 0.02)
+        return
+    vertices, _ = posed_surface(avatar, PosedAvatar(body, None), 0.02)
+    assert len(vertices) > 100

@@ -26,7 +26,8 @@ def posed_surface(
 
     if avatar.level_space == "posed":
         return extract_surface(level, posed.body.vertices.detach(), voxel)
-    vertices, faces = extract_surface(level, posed.body.canonical_vertices, voxel)
+    # What lies further out has never been rendered, so nothing says what is there.
+    vertices, faces = extract_surface(level, posed.body.canonical_vertices, voxel, radius=min(avatar.reach, 0.1))
     return pose_surface(vertices, posed.body), faces
 
 
