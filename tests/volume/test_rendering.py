@@ -131,3 +131,19 @@ def test_points_lie_on_their_rays():
 def test_no_samples_render_nothing():
     samples, density = packed([0, 0])
     assert composite(composite_weights(density, samples), torch.zeros(0, 3, dtype=torch.float64), samples, 2).sum() == 0
+
+
+@given(counts=COUNTS, seed=st.integers(0, 1000))
+def test_compiled_weights_and_their_gradient_are_those_of_the_twin(counts, seed):
+    samples, density = packed(counts, seed)
+    density = 0.1 * density
+    pull = torch.rand(len(density), generator=torch.Generator().manual_seed(seed)) - 0.3
+
+    def both(dtype):
+        sigma = density.to(dtype).requires_grad_()
+        cast = Samples(samples.ray_index, samples.depth.to(dtype), samples.delta.to(dtype))
+        weights = composite_weights(sigma, cast)
+        return weights.detach(), torch.autograd.grad((weights * pull.to(dtype)).sum(), sigma)[0]
+
+    for single, double in zip(both(torch.float32), both(torch.float64), strict=True):
+        torch.testing.assert_close(single.double(), double, atol=1e-6, rtol=1e-4)

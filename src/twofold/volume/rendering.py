@@ -1,9 +1,13 @@
 """From signed distances to pixels: density, packed samples, compositing."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from twofold.volume import rendering_kernels as kernels
 from twofold.volume.samples import Samples
 
 
@@ -43,7 +47,28 @@ def composite_weights(density: Float[Tensor, "S"], samples: Samples) -> Float[Te
         samples: packed.
     """
     optical = density * samples.delta
+    if optical.dtype == torch.float32 and not optical.is_cuda:
+        return _Weights.apply(optical, samples.ray_index)  # type: ignore[return-value]
     return torch.exp(-optical_depth(optical, samples)) * -torch.expm1(-optical)
+
+
+class _Weights(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, optical: Tensor, ray_index: Tensor) -> Tensor:  # type: ignore[override]
+        optical, ray_index = optical.detach().contiguous(), ray_index.contiguous()
+        out = torch.empty_like(optical)
+        kernels.weights(optical.numpy(), ray_index.numpy(), out.numpy())
+        ctx.save_for_backward(optical, ray_index, out)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_weight: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        optical, ray_index, out = ctx.saved_tensors
+        by_optical = torch.empty_like(optical)
+        given = (optical, ray_index, out, by_weight.contiguous(), by_optical)
+        kernels.weights_backward(*(tensor.detach().numpy() for tensor in given))
+        return by_optical, None
 
 
 def optical_depth(optical: Float[Tensor, "S"], samples: Samples) -> Float[Tensor, "S"]:
