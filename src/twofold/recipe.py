@@ -32,12 +32,15 @@ class PixelConfig:
     """Whether a single ray passes anywhere in its pixel's square, with colours interpolated between pixels."""
     replacement: bool = True
     """Whether the same single pixel may be drawn twice; the release draws without replacement."""
+    memory_gb: float = 1.0
+    """Memory for the parts of the training images that show the person, GiB; what it does not hold lies in a temporary
+    file. Batches are the same."""
 
     def __post_init__(self) -> None:
         """Refuses choices with which no image gives pixels, or more than any machine takes."""
         require_within(
             self, rays=(0, 1_000_000), subject_share=(0, 1), surroundings=(0, 10_000), patches=(0, 1000),
-            patch_size=(1, 1024), patch_on_subject=(0, 1),
+            patch_size=(1, 1024), patch_on_subject=(0, 1), memory_gb=(0, 1e6),
         )  # fmt: skip
         if self.rays == 0 and self.patches == 0:
             raise ValueError("rays=0 and patches=0 leave no pixels; set one of them")

@@ -122,5 +122,5 @@ def test_a_training_that_the_memory_does_not_hold_names_the_setting(person_folde
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 2, done.stderr
-    assert "The memory does not suffice; lower --set training.pixels.rays=" in done.stderr
+    assert "The memory does not suffice; lower --set training.pixels.memory_gb=" in done.stderr
     assert "Traceback" not in done.stderr

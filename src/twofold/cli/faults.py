@@ -22,7 +22,8 @@ _OUT_OF_MEMORY = re.compile(
 )
 """How torch, CUDA and C++ say so; torch for a CPU has no class of its own for it."""
 _LOWER = {
-    "train": "lower --set training.pixels.rays=... first, then widen --set method.field.low_voxels=... and high_voxels",
+    "train": "lower --set training.pixels.memory_gb=... and training.pixels.rays=..., then widen --set "
+    "method.field.low_voxels=... and high_voxels",
     "render": "lower --chunk, then --size",
     "evaluate": "measure no meshes (--max-meshes 0), or close other programs",
     "check": "check fewer images (--max-images)",

@@ -1,10 +1,8 @@
 """Pixels for training: which rays of which image a step looks at."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
@@ -14,41 +12,11 @@ from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Rays, clip_to_box, pixel_grid, pixel_rays, project, without_tiny_components
 from twofold.methods.base import Batch
 from twofold.recipe import PixelConfig
-
-
-@dataclass(frozen=True)
-class _TrainingImage:
-    image: Tensor
-    mask: Tensor
-    subject: Tensor
-    reachable: Tensor
-    inside: Bool[Tensor, "h w"]
-    known: Bool[Tensor, "h w"]
-
-    def colors(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Colours of flat pixels, 0..1."""
-        return self.image.flatten(0, 1)[index].float() / 255
-
-    def coverage(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """Share of flat pixels that the person covers, 0..1."""
-        return self.mask.flatten()[index].float() / 255
-
-    def between(self, position: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-        """Colour and coverage at places (column, row) between the middles of pixels, bilinearly interpolated."""
-        height, width = self.inside.shape
-        low = position.floor().minimum(torch.tensor([max(width - 2, 0), max(height - 2, 0)])).clamp_min(0)
-        part, (column, row) = position - low, low.long().unbind(-1)
-        color, coverage = torch.zeros(len(position), 3), torch.zeros(len(position))
-        for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
-            index = (row + down).clamp_max(height - 1) * width + (column + right).clamp_max(width - 1)
-            weight = (part[:, 0] if right else 1 - part[:, 0]) * (part[:, 1] if down else 1 - part[:, 1])
-            color = color + weight[:, None] * self.colors(index)
-            coverage = coverage + weight * self.coverage(index)
-        return color, coverage
+from twofold.training.regions import INSIDE, KNOWN, REACHABLE, ImageRegion, RegionStore, cut_out
 
 
 class PixelSource:
-    """Draws batches from frames; images are read once and kept as bytes."""
+    """Draws batches from frames; of each image, read once, the part around the person is kept (`RegionStore`)."""
 
     def __init__(
         self, frames: tuple[Frame, ...], body: Body, betas: Float[Tensor, "S"], config: PixelConfig,
@@ -66,19 +34,21 @@ class PixelSource:
         """
         self.frames, self.config, self.margin, self.box_margin = frames, config, margin, box_margin
         self._shaped = shape_body(body, betas)
-        self._images: dict[int, _TrainingImage] = {}
+        self._images = RegionStore(config.memory_gb * 2**30)
 
-    def image(self, which: int) -> _TrainingImage:
+    def image(self, which: int) -> ImageRegion:
         """The frame's image and the pixels that may be drawn.
 
         Raises:
             TwofoldError: its mask shows nobody, or nobody who is not ignored.
         """
-        if which not in self._images:
-            self._images[which] = self._read(self.frames[which])
-        return self._images[which]
+        found = self._images.get(which)
+        if found is None:
+            found = self._read(self.frames[which])
+            self._images.put(which, found)
+        return found
 
-    def _read(self, frame: Frame) -> _TrainingImage:
+    def _read(self, frame: Frame) -> ImageRegion:
         mask = frame.mask()
         image = frame.image()
         inside = mask > (0.5 if self.config.subject == "half" else 0)
@@ -108,14 +78,9 @@ class PixelSource:
                 f"{frame.ignored_file} ignores all of the person; leave the image out of the training frames."
             )
         subject &= reachable
-        return _TrainingImage(
-            (image * 255).round().to(torch.uint8),
-            (mask * 255).round().to(torch.uint8),
-            subject.flatten().nonzero()[:, 0].int(),
-            reachable.flatten().nonzero()[:, 0].int(),
-            inside,
-            known,
-        )
+        # Patches reach beyond the pixels that may be drawn, and interpolation to the next pixel.
+        border = self.config.patch_size if self.config.patches else 1
+        return cut_out(image, mask, subject, reachable, inside, known, border)
 
     def _near_body(self, frame: Frame, body: PosedBody, inside: Tensor) -> Tensor:
         """Pixels whose ray may meet the body: the projected vertices and the mask, grown by the margin."""
@@ -142,23 +107,21 @@ class PixelSource:
     def draw(self, which: int, generator: torch.Generator, device: torch.device | str = "cpu") -> Batch:
         """A batch from frame number `which`; the generator decides everything."""
         original, config = self.image(which), self.config
-        height, width = original.image.shape[:2]
+        height, width = original.size
         near = round(config.rays * config.subject_share)
         chosen = [
-            pool[self._choose(len(pool), count, generator)].long()
+            pool[self._choose(len(pool), count, generator)]
             for pool, count in ((original.subject, near), (original.reachable, config.rays - near))
         ]
         patches = torch.full((config.patches, config.patch_size, config.patch_size), -1, dtype=torch.long)
         patch_image, patch_mask = torch.zeros(*patches.shape, 3), torch.zeros(patches.shape)
         used = config.rays
-        reachable = torch.zeros(height * width, dtype=torch.bool)
-        reachable[original.reachable.long()] = True
         for patch in range(config.patches):
-            window, within = self._window(original, reachable, generator)
-            shown = within & original.known.flatten()[window]
+            window, within = self._window(original, generator)
+            shown = within & original.has(KNOWN, window)
             patch_image[patch].view(-1, 3)[shown] = original.colors(window[shown])
             patch_mask[patch].view(-1)[shown] = original.coverage(window[shown])
-            rays = (within & reachable[window]).nonzero()[:, 0]
+            rays = (within & original.has(REACHABLE, window)).nonzero()[:, 0]
             patches[patch].view(-1)[rays] = torch.arange(used, used + len(rays))
             chosen.append(window[rays])
             used += len(rays)
@@ -191,13 +154,13 @@ class PixelSource:
             return torch.randint(pool, (count,), generator=generator)
         return torch.randperm(pool, generator=generator)[:count]
 
-    def _window(self, image: _TrainingImage, reachable: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def _window(self, image: ImageRegion, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Flat pixels of one patch row by row, and which of them lie in the image."""
         size = self.config.patch_size
-        height, width = image.image.shape[:2]
+        height, width = image.size
         on_subject = bool(torch.rand((), generator=generator) < self.config.patch_on_subject)
-        outside = reachable & ~image.inside.flatten()
-        pool = (image.inside.flatten() if on_subject or not outside.any() else outside).nonzero()[:, 0]
+        outside = image.having(REACHABLE, without=INSIDE)
+        pool = image.having(INSIDE) if on_subject or not len(outside) else outside
         center = int(pool[torch.randint(len(pool), (), generator=generator)])
         top = min(max(center // width - size // 2, 0), max(height - size, 0))
         left = min(max(center % width - size // 2, 0), max(width - size, 0))
