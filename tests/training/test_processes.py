@@ -11,14 +11,19 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_recipes import CASES
 from tiny_person import tiny_recipe
 
 from twofold.capture.types import Capture
 from twofold.files import write_json
-from twofold.methods.table import recipe_to_dict
+from twofold.losses import total
+from twofold.methods.base import Mode
+from twofold.methods.subject import Subject
+from twofold.methods.table import RECIPES, recipe_to_dict
 from twofold.recipe import Recipe
 from twofold.training.curves import Curves
-from twofold.training.loop import train
+from twofold.training.loop import Step, train
+from twofold.training.pixels import PixelSource
 from twofold.training.processes import Team, announced
 from twofold.training.run import read_checkpoint
 
@@ -118,3 +123,33 @@ def test_a_process_whose_partner_ends_says_so_in_one_sentence(person: Capture, t
     code, said = ended(team)[0]
     assert code == 2, said
     assert said.strip() == "twofold: Another of the processes that train together has ended; what it says is the cause."
+
+
+@pytest.mark.parametrize("name", [name for name in RECIPES if name.endswith("_fast")])
+def test_parts_of_a_step_add_up_to_the_whole_by_every_method(name: str, person: Capture) -> None:
+    """What each of two processes computes of a step, averaged as DDP does, is what one computes."""
+    start = CASES[name]
+    training = replace(start.training, images_per_step=2, pixels=replace(start.training.pixels, rays=24))
+    subject = Subject.of(person)
+    avatar = start.method.build(subject, 0)
+    avatar.check_capture = lambda capture: None  # the tiny person has no background
+    avatar.prepare_training(person, 0, torch.Generator().manual_seed(0))
+    stage = avatar.stages(training)[0]
+    source = PixelSource(person.train, subject.body, subject.betas, stage.training.pixels, avatar.ray_margin)
+    step = Step(avatar, source, torch.tensor(person.background), stage, 0)
+    mode = Mode(step=40, epoch=16)
+
+    def gradients(team: Team) -> tuple[dict[str, torch.Tensor], float]:
+        avatar.zero_grad(set_to_none=True)
+        terms, _ = step(40, mode, team)
+        loss = total(terms)
+        loss.backward()
+        return {n: p.grad.clone() for n, p in avatar.named_parameters() if p.grad is not None}, float(loss.detach())
+
+    whole, loss = gradients(Team())
+    parts = [gradients(Team(rank, 2)) for rank in range(2)]
+    assert loss == pytest.approx(sum(part for _, part in parts) / 2, rel=1e-5)
+    assert whole
+    for key, gradient in whole.items():
+        mean = sum((part.get(key, torch.zeros_like(gradient)) for part, _ in parts), torch.zeros_like(gradient)) / 2
+        assert (mean - gradient).norm() <= 1e-3 * gradient.norm() + 1e-9, key
