@@ -11,6 +11,7 @@ processor on one thread, so that other programs on the machine count little.
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
 import time
 from dataclasses import replace
@@ -19,7 +20,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.common import store, studio_capture
+from benchmarks.common import RESULTS, store, studio_capture
 from twofold.capture.folder import read_capture
 from twofold.capture.types import Capture
 from twofold.kernels.runtime import flush_denormals, tune_process
@@ -31,6 +32,8 @@ from twofold.training.loop import make_optimizer
 from twofold.training.pixels import PixelSource
 from twofold.training.run import find_capture, load
 
+NAME = "method-steps-cpu-1threads"
+"""Of the stored file; methods that are not measured again stay in it as they are."""
 PAIRS = [name for method in METHODS.values() for name in method.recipes if f"{name}_fast" in RECIPES]
 FAST_STEPS = 8
 """Steps of the fast form: one period of what is kept between steps."""
@@ -122,10 +125,14 @@ def main() -> None:
     tune_process()
     flush_denormals()
     runs = {name: Path(folder) for name, _, folder in (text.partition("=") for text in arguments.run)}
+    stored = RESULTS / f"{NAME}.json"
+    before = json.loads(stored.read_text("utf-8")) if stored.is_file() else {}
+    kept = before if before.get("rays") == arguments.rays else {}
     result: dict[str, Any] = {
         "what": "training step of each method, seconds of the processor, one thread; busy machine",
         "rays": arguments.rays,
-        "methods": {},
+        "methods": kept.get("methods", {}),
+        "weight_volume": kept.get("weight_volume", {}),
     }
     for name in arguments.methods:
         capture = read_capture(find_capture(runs[name])) if name in runs else studio_capture(192)
@@ -137,7 +144,7 @@ def main() -> None:
         print(f"{name}: dense {dense['mean_s']:.2f} s, fast {fast['mean_s']:.3f} s, {ratio:.1f} times", flush=True)
     if "humannerf" in arguments.methods:
         result["weight_volume"] = weight_volume(capture)
-    store("method-steps-cpu-1threads", result)
+    store(NAME, result)
 
 
 if __name__ == "__main__":

@@ -64,6 +64,10 @@ def results_page(results: dict[str, Any]) -> str:
         "a hand-written reverse pass and bfloat16 hidden layers; the reference form is the usual one: error-bounded "
         "sampler, autograd through autograd, dense samples, float32. `python -m benchmarks.step`.\n\n"
         + _steps(_named(results, "step-")),
+        "## Training step of the other methods\n\nThe fast recipe against the form of the authors' program (every "
+        "sample shaded, float32, gradients by automatic differentiation): same networks, weights and rays. Seconds of "
+        "the processor on one thread, measured while other programs ran. `python -m benchmarks.method_steps`.\n\n"
+        + _method_steps(results["method-steps-cpu-1threads"]),
         "## Rendering\n\nSeconds for one image, posing included. `python -m benchmarks.rendering`.\n\n"
         + _rendering(_named(results, "rendering-")),
         "## Quality against time\n\nSynthetic subject, one training camera; PSNR over the subject's box. "
@@ -155,6 +159,24 @@ def _steps(results: dict[str, Any]) -> str:
         for result in results.values() for name in ("quick", "fast", "reference") for part in [result[name]]
     ]  # fmt: skip
     return _table(("Threads", "Form", "Step", "Rays per second", "Samples per ray", "Memory", "Times faster"), rows)
+
+
+def _method_steps(result: dict[str, Any]) -> str:
+    rows = [
+        (
+            name, f"{part['trained_steps']:,}", str(result["rays"]), f"{part['dense']['mean_s']:.2f} s",
+            f"{part['fast']['mean_s']:.2f} s", f"{part['times_faster']:.1f}",
+        )
+        for name, part in result["methods"].items()
+    ]  # fmt: skip
+    volume = result["weight_volume"]
+    note = (
+        f"HumanNeRF's weight volume alone takes {sum(volume.values()):.2f} s whatever the rays (forward "
+        f"{volume['forward_s']:.2f} s, backward {volume['backward_s']:.2f} s, update {volume['update_s']:.2f} s); "
+        "`humannerf_fast` and `monohuman_fast` pay it at every 8th step.\n"
+    )
+    head = ("Method", "Trained for, steps", "Rays", "Dense step", "Fast step", "Times faster")
+    return f"{_table(head, rows)}\n{note}"
 
 
 def _rendering(results: dict[str, Any]) -> str:

@@ -133,7 +133,8 @@ def pm_avatar() -> Recipe:
 def pm_avatar_fast() -> Recipe:
     """The same networks and losses; only samples in a box's window, one image a step, a short schedule."""
     start = pm_avatar()
-    method = replace(start.method, boxed=affordable(start.method.boxed), min_window=1e-4, misses="empty")
+    rates = PmAvatarRates(field=3e-4, radiance=1e-3)
+    method = replace(start.method, boxed=affordable(start.method.boxed), rates=rates, min_window=1e-4, misses="empty")
     return replace(start, name="pm_avatar_fast", method=method, training=short_training(start.training))
 
 
