@@ -67,7 +67,7 @@ $(VENV)/.ready-studio: pyproject.toml constraints.txt | $(VENV)/.made
 
 $(VENV)/.ready-all: pyproject.toml constraints.txt | $(VENV)/.made
 	@echo "Setting up $(VENV) with all tools: downloads some 900 MB, once."
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio,prepare,export,data,test,docs,dev]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio,prepare,export,viewer,data,test,docs,dev]'
 	@touch $@ $(VENV)/.ready-studio
 
 $(VENV)/.made:

@@ -2,6 +2,7 @@
 
 import functools
 import http.server
+import importlib.util
 import json
 import os
 import queue
@@ -23,6 +24,17 @@ def require_web(*programs: str) -> None:
     missing = [name for name in programs if not any(shutil.which(one) for one in name.split("|"))]
     if not (WEB / "node_modules" / "three").is_dir():
         missing.append("the packages of `make web-tools`")
+    if missing:
+        reason = f"not here: {', '.join(missing)}"
+        if os.environ.get("TWOFOLD_REQUIRE_WEB") == "1":
+            pytest.fail(reason)
+        pytest.skip(reason)
+
+
+def require_browser() -> None:
+    """Skips the test, or fails it where TWOFOLD_REQUIRE_WEB=1, unless Chromium and the package viser are there."""
+    missing = [] if any(shutil.which(one) for one in BROWSERS) else ["|".join(BROWSERS)]
+    missing += [] if importlib.util.find_spec("viser") else ["the package viser"]
     if missing:
         reason = f"not here: {', '.join(missing)}"
         if os.environ.get("TWOFOLD_REQUIRE_WEB") == "1":

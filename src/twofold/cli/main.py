@@ -28,6 +28,7 @@ from twofold.cli.motions import NO_MOTION, MotionView, motion, render_by_mesh, r
 from twofold.cli.protocol_table import networks_asked_for, print_protocols
 from twofold.cli.reports import report
 from twofold.cli.streams import streams_that_never_fail
+from twofold.cli.viewing import NO_VIEW, LiveView, training_view, view
 from twofold.errors import TwofoldError
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ def train(
     settings: bool = False,
     body: Path | None = None,
     split: SplitName | None = None,
+    live: Annotated[LiveView, tyro.conf.OmitArgPrefixes] = NO_VIEW,
 ) -> None:
     """Train an avatar from a capture folder.
 
@@ -63,6 +65,7 @@ def train(
         settings: Shows every setting that --set can change, as the recipe has it, and does nothing else.
         body: Your own SMPL file, for a data set.
         split: Whose training and test images, for a data set.
+        live: A viewer in the browser.
     """
     if settings:
         _show_settings(recipe, set, seed)
@@ -92,11 +95,18 @@ def train(
     require(validate(source), source)
     read = read_capture(source)
     try:
-        with bar("Training") as progress:
+        with training_view(live, read, folder) as watched, bar("Training") as progress:
+
+            def after_step(done: loop.Progress) -> None:
+                progress(done.step / done.steps, _note(done))
+                watched.step()
+
+            def before_first(avatar: "Avatar") -> str | None:
+                watched.attach(avatar)
+                return attach_perceptual(avatar)
+
             loop.train(
-                read, chosen, folder, where, resume is not None,
-                lambda p: progress(p.step / p.steps, _note(p)),
-                attach_perceptual,
+                read, chosen, folder, where, resume is not None, after_step, before_first,
                 lambda avatar, step: save_preview(avatar, read, folder, step),
                 lambda note: console().print(note, soft_wrap=True),
             )  # fmt: skip
@@ -287,6 +297,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "export": export,
     "reproduce": reproduce,
     "report": report,
+    "view": view,
 }
 
 

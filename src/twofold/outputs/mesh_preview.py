@@ -30,6 +30,18 @@ def render_mesh(
         samples: along each side of a pixel.
         headlight: shade by how far the surface is turned from the camera; else colours are shown as they are.
     """
+    return render_mesh_depth(character, vertices, camera, background, samples, headlight)[0]
+
+
+def render_mesh_depth(
+    character: Character,
+    vertices: Float[np.ndarray, "V 3"],
+    camera: Camera,
+    background: Float[np.ndarray, "3"],
+    samples: int = 2,
+    headlight: bool = False,
+) -> tuple[Float[np.ndarray, "h w 4"], Float[np.ndarray, "h w"]]:
+    """`render_mesh`, and the distance along the camera's axis, metres: infinite where no sample sees the mesh."""
     fine = supersampled(camera, samples)
     transform = fine.world_to_camera.double().numpy()
     points = np.zeros((len(vertices), 3), dtype=np.float32)
@@ -50,7 +62,9 @@ def render_mesh(
     given = (points, faces, face, corners, uv, texture, np.ascontiguousarray(character.colors, dtype=np.float32))
     in_parts(camera.height, lambda first, end: shade(*given, light, samples, image, first, end), least=16)
     image[..., :3] += (1 - image[..., 3:]) * background.astype(np.float32)
-    return image
+    nearest = inverse.reshape(camera.height, samples, camera.width, samples).max((1, 3))
+    with np.errstate(divide="ignore"):
+        return image, 1 / nearest
 
 
 def _headlight(vertices: np.ndarray, character: Character, camera: Camera) -> np.ndarray:
