@@ -43,7 +43,7 @@ class Chromium:
             assert time.monotonic() < deadline, "Chromium did not start"
             time.sleep(0.05)
         port, path = file.read_text().split()
-        self._socket = connect(f"ws://127.0.0.1:{port}{path}", max_size=None, compression=None)
+        self._socket = connect(f"ws://127.0.0.1:{port}{path}", max_size=None, compression=None, ping_interval=None)
         self._session: str | None = None
         pages = [t for t in self.call("Target.getTargets")["targetInfos"] if t["type"] == "page"]
         target = pages[0]["targetId"]

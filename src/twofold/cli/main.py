@@ -32,6 +32,7 @@ from twofold.cli.viewing import NO_VIEW, LiveView, training_view, view
 from twofold.errors import TwofoldError
 
 if TYPE_CHECKING:
+    from twofold.methods.base import Avatar
     from twofold.recipe import Recipe
     from twofold.training.loop import Progress
 

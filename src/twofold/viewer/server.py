@@ -5,6 +5,7 @@ import errno
 import importlib
 import io
 import ipaddress
+import logging
 import socket
 from collections.abc import Generator
 from typing import Any
@@ -103,6 +104,8 @@ def open_server(host: str, port: int, title: str) -> Any:
         def request_share_url(self, verbose: bool = True) -> None:
             """Any page that is connected may ask for it; nothing happens."""
 
+    # Browsers open connections ahead and close them unused, each of which it reports as a failed handshake.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     with quiet():
         server = Server(host=host, port=port, label=title, verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
