@@ -32,7 +32,6 @@ from twofold.cli.viewing import NO_VIEW, LiveView, training_view, view
 from twofold.errors import TwofoldError
 
 if TYPE_CHECKING:
-    from twofold.methods.base import Avatar
     from twofold.recipe import Recipe
     from twofold.training.loop import Progress
 
@@ -76,7 +75,6 @@ def train(
     from twofold.outputs.gallery import save_preview
     from twofold.training import loop
     from twofold.training.lock import require_unlocked
-    from twofold.training.perceptual_loss import attach_perceptual
     from twofold.training.run import RECIPE, choose_device, find_capture, read_recipe
 
     if resume is None:
@@ -97,17 +95,9 @@ def train(
     read = read_capture(source)
     try:
         with training_view(live, read, folder) as watched, bar("Training") as progress:
-
-            def after_step(done: loop.Progress) -> None:
-                progress(done.step / done.steps, _note(done))
-                watched.step()
-
-            def before_first(avatar: "Avatar") -> str | None:
-                watched.attach(avatar)
-                return attach_perceptual(avatar)
-
             loop.train(
-                read, chosen, folder, where, resume is not None, after_step, before_first,
+                read, chosen, folder, where, resume is not None,
+                lambda p: watched.after_step(progress(p.step / p.steps, _note(p))), watched.before_first,
                 lambda avatar, step: save_preview(avatar, read, folder, step),
                 lambda note: console().print(note, soft_wrap=True),
             )  # fmt: skip

@@ -95,7 +95,18 @@ class _Training:
     """What a training calls: with the avatar, and after each step."""
 
     def __init__(self, attach: "Callable[[Avatar], None]", step: Callable[[], None]) -> None:
-        self.attach, self.step = attach, step
+        self._attach, self._step = attach, step
+
+    def before_first(self, avatar: "Avatar") -> str | None:
+        """Takes the new avatar, and attaches its perceptual network; see `loop.train`."""
+        from twofold.training.perceptual_loss import attach_perceptual
+
+        self._attach(avatar)
+        return attach_perceptual(avatar)
+
+    def after_step(self, _shown: None) -> None:
+        """Lets the viewer render what is due, when progress has been shown."""
+        self._step()
 
 
 @contextlib.contextmanager

@@ -141,7 +141,7 @@ def _generation(joint: int) -> int:
 
 
 def depth_colors(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Depths as colours, yellow near and violet far, over the range of all but a hundredth; infinite ones are background."""
+    """Depths as colours, yellow near and violet far, over the range of nearly all; infinite ones background."""
     seen = np.isfinite(depth)
     image = np.tile((np.array(PAPER) * 255 + 0.5).astype(np.uint8), (*depth.shape, 1))
     if seen.any():
