@@ -81,6 +81,15 @@ def with_settings(recipe: Recipe, settings: Sequence[str]) -> Recipe:
     return with_overrides(recipe, renamed)
 
 
+def learning_rates(recipe: Recipe) -> dict[str, float]:
+    """The method's learning rates by the names of their settings.
+
+    >>> learning_rates(RECIPES["danbo"]())
+    {'method.rates.all': 0.0005}
+    """
+    return {f"method.rates.{name}": rate for name, rate in to_dict(recipe.method.rates).items()}
+
+
 def _renamed(data: dict[str, Any]) -> dict[str, Any]:
     """Stored settings under their present names."""
     new = json.loads(json.dumps(data))

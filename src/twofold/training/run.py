@@ -18,13 +18,12 @@ from torch import Tensor
 from twofold import __version__
 from twofold.capture.layout import DESCRIPTION
 from twofold.capture.types import Capture
-from twofold.config import to_dict
 from twofold.errors import TwofoldError
 from twofold.files import new_folder, plain_errors, write_atomically, write_json, write_npz
 from twofold.inputs import is_there, read_json, require_file, shown, shown_path
 from twofold.methods.base import Avatar
 from twofold.methods.subject import Subject
-from twofold.methods.table import recipe_from_dict, recipe_to_dict
+from twofold.methods.table import learning_rates, recipe_from_dict, recipe_to_dict
 from twofold.npz import read_npz
 from twofold.recipe import Recipe
 from twofold.training.clock import Spent
@@ -43,7 +42,7 @@ def lower_rates(recipe: Recipe) -> str:
     >>> lower_rates(RECIPES["danbo"]())
     'lower the learning rates (now method.rates.all=0.0005; --set changes them) and train again'
     """
-    rates = ", ".join(f"method.rates.{name}={rate:g}" for name, rate in to_dict(recipe.method.rates).items())
+    rates = ", ".join(f"{name}={rate:g}" for name, rate in learning_rates(recipe).items())
     return f"lower the learning rates (now {rates}; --set changes them) and train again"
 
 
