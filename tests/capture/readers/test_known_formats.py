@@ -102,7 +102,10 @@ def test_the_world_stands_upright_on_its_floor(name, read_back):
     assert abs(np.quantile(lows, 0.1)) < 0.1
 
 
-@pytest.mark.parametrize(("subject", "from_one", "cameras"), [("CoreView_386", False, 23), ("CoreView_315", True, 21)])
+@pytest.mark.parametrize(
+    ("subject", "from_one", "cameras"),
+    [pytest.param("CoreView_386", False, 23, marks=pytest.mark.slow), ("CoreView_315", True, 21)],
+)
 def test_all_cameras_of_zju_mocap(subject, from_one, cameras, tmp_path):
     full = make_scene(tmp_path, frames=3, cameras=cameras, size=32)
     source = datasets.write_zju(tmp_path / subject, full, from_one)
