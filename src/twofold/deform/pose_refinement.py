@@ -63,6 +63,19 @@ class PoseRefinement(nn.Module):
             return pose, translation
         return pose + torch.cat([self.root[row], self.body[row]]), translation + self.translation[row]
 
+    def project(self, projections: Float[Tensor, "T 75 75"]) -> None:
+        """Takes out of each frame's correction what its projection removes (`deform.observability`).
+
+        Args:
+            projections: of the 72 numbers of the pose and the translation, one for each frame.
+        """
+        with torch.no_grad():
+            whole = torch.cat([self.root.flatten(1), self.body.flatten(1), self.translation], 1)
+            kept = (projections @ whole[..., None])[..., 0]
+            self.root.copy_(kept[:, None, :3])
+            self.body.copy_(kept[:, 3:72].unflatten(1, (23, 3)))
+            self.translation.copy_(kept[:, 72:])
+
     def at(
         self, time: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], known: KnownPoses,
         max_gap: float,

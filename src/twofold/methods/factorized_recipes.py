@@ -92,7 +92,9 @@ def fast() -> Recipe:
         field=replace(start.method.field, hidden_dtype="auto"),
         sampler=ShellSampler(),
         losses=losses,
-        pose=replace(start.method.pose, epochs="moments", canonical_shape="refined", test_shape="refined"),
+        pose=replace(
+            start.method.pose, epochs="moments", canonical_shape="refined", test_shape="refined", observed_only=True
+        ),
         late_neighbours=None,
         falloff="exponential",
         normals_by="posed",
@@ -125,7 +127,13 @@ def quick() -> Recipe:
             ),
             rates=RateConfig(low=2e-3, high=2e-3, grid=1e-2, beta=3e-4, pose=5e-4),
             pose=PoseConfig(
-                zero_until=200, zero_every=0, drop=0.2, refine_from=200, canonical_shape="refined", test_shape="refined"
+                zero_until=200,
+                zero_every=0,
+                drop=0.2,
+                refine_from=200,
+                canonical_shape="refined",
+                test_shape="refined",
+                observed_only=True,
             ),
             neighbours=6,
             late_neighbours=None,

@@ -32,6 +32,9 @@ class PoseConfig:
     refine: tuple[Literal["root", "body", "translation", "shape"], ...] = ("root", "body", "translation", "shape")
     refine_from: int = 0
     """First step at which poses are corrected."""
+    observed_only: bool = False
+    """Whether corrections leave directions alone that no training camera of the frame sees (ours; see
+    `twofold.deform.observability`)."""
     canonical_shape: Literal["refined", "given"] = "refined"
     """Whose joints bones leave canonical space from: the corrected shape's, or, as released, those of the one given."""
     test_shape: Literal["refined", "given"] = "refined"

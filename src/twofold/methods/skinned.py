@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from twofold.body.skeleton import PosedBody, ShapedBody, movements, pose_body, shape_body
+from twofold.capture.types import Capture
 from twofold.config import require
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.deform.skinning import normal_matrices, to_canonical, vertex_transforms, weights_by
@@ -25,7 +26,7 @@ from twofold.methods.base import EVALUATION, Avatar, Batch, Mode, PosedAvatar, R
 from twofold.methods.loss_terms import loss_terms
 from twofold.methods.pose_schedule import condition
 from twofold.methods.skinned_config import CanonicalField, SkinnedConfig, SkinnedPose
-from twofold.methods.subject import Subject
+from twofold.methods.subject import Subject, observed_corrections
 from twofold.metrics.perceptual import LPIPS
 from twofold.sampling.placement import Deformation, FieldQuery, Placement, Sampler
 from twofold.sampling.posed_surface import PosedSurface
@@ -75,6 +76,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         if config.late_neighbours is not None:
             self.register_buffer("late_shape", torch.zeros_like(subject.betas))
         self._steps = 0
+        self._observed: Tensor | None = None
         self._shells: dict[int, Shell] = {}
         self._bodies = {torch.device("cpu"): subject.body}
         self._perceptual: tuple[LPIPS, ...] = ()
@@ -157,6 +159,15 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         for row in moved.nonzero()[:, 0].tolist():
             self.shell_poses[row], self.shell_translations[row] = poses[row], translations[row]
             self._shells.pop(row, None)
+
+    def after_step(self, mode: Mode, capture: Capture) -> Literal["continue", "restart"]:
+        """Takes out of the corrections what no training camera sees, where that is asked for."""
+        pose = self.config.pose
+        if pose.observed_only and self.refinement.parts and (mode.step or 0) >= pose.refine_from:
+            if self._observed is None:
+                self._observed = observed_corrections(self.subject, capture, pose.refine).to(self.device)
+            self.refinement.project(self._observed)
+        return "continue"
 
     def pose(
         self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], frame_index: int | None = None,
@@ -349,7 +360,7 @@ SHELL_MARGIN = 0.005
 """How far a body may move before its shell is built anew, metres: a quarter of a voxel. Until then samples are measured
 against the moved body; only at the shell's rim, centimetres from the body, some are missed."""
 SHELLS_KEPT = 512
-"""Shells of training frames that are kept, of two or three megabytes each; beyond that the oldest is dropped."""
+"""Shells of training frames that are kept, of two or three megabytes each; the one made first gives way."""
 _BETA_UNIT = 0.01
 """Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""
 

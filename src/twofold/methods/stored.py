@@ -5,7 +5,10 @@ from typing import cast
 ABSENT: dict[str, dict[str, object]] = {
     "method": {"late_neighbours": None, "late_from": 100, "normals_by": "posed", "background": "capture"},
     "method.sampler": {"units": "metres", "box": "posed"},
-    "method.pose": {"zero_epochs": 0, "epochs": "moments", "canonical_shape": "refined", "test_shape": "refined"},
+    "method.pose": {
+        "zero_epochs": 0, "epochs": "moments", "canonical_shape": "refined", "test_shape": "refined",
+        "observed_only": False,
+    },
     "method.losses": {
         "lpips_dropout": 0.0, "lpips_off_box": "black", "s3im_center": 1.5, "eikonal_replacement": True,
         "base_mask": 0.0,

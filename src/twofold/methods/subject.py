@@ -1,5 +1,6 @@
 """The person that an avatar is made of."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,8 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from twofold.body.skeleton import Body
+from twofold.body.skeleton import Body, shape_body
 from twofold.capture.types import Capture
+from twofold.deform.observability import observed_projection, pose_jacobian
 from twofold.errors import TwofoldError
 from twofold.npz import are_moderate
 
@@ -83,3 +85,29 @@ class Subject:
             translations=torch.as_tensor(arrays["translations"]).float(),
             scene_scale=float(arrays["scene_scale"]),
         )
+
+
+def observed_corrections(subject: Subject, capture: Capture, parts: Sequence[str]) -> Float[Tensor, "T 75 75"]:
+    """For each training frame the projection of a pose correction onto what its training cameras see.
+
+    Args:
+        subject: with the poses as given.
+        capture: whose training cameras count.
+        parts: what is corrected at all: "root", "body", "translation"; other numbers stay.
+    """
+    shaped = shape_body(subject.body, subject.betas)
+    corrected = [name for name, count in (("root", 3), ("body", 69), ("translation", 3)) for _ in range(count)]
+    free = torch.tensor([name in parts for name in corrected])
+    centers: dict[int, list[Tensor]] = {}
+    for frame in capture.train:
+        centers.setdefault(frame.frame_index, []).append(frame.camera.center)
+    out = torch.zeros(len(subject.times), 75, 75)
+    for row, time in enumerate(subject.times.tolist()):
+        points, moves = pose_jacobian(shaped, subject.poses[row], subject.translations[row])
+        if not bool(free.any()):
+            continue
+        seen = observed_projection(points, moves[..., free], torch.stack(centers[time]))
+        out[row] = out[row].index_put(
+            tuple(torch.meshgrid(*2 * [torch.nonzero(free)[:, 0]], indexing="ij")), seen.float()
+        )
+    return out

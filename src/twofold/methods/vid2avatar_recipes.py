@@ -90,7 +90,7 @@ def _faster(recipe: Recipe) -> Recipe:
         field=replace(start.field, gradients="analytic", hidden_dtype="auto"),
         sampler=ShellSampler(radius=0.08, step=0.01, min_weight=2e-3),
         losses=replace(start.losses, eikonal_replacement=True),
-        pose=replace(start.pose, zero_epochs=5, canonical_shape="refined"),
+        pose=replace(start.pose, zero_epochs=5, canonical_shape="refined", observed_only=True),
         falloff="exponential",
         normals_by="posed",
         beta=0.02,
