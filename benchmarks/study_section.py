@@ -92,7 +92,7 @@ def section(study: Mapping[str, Any], table: Table) -> str:
         f"By how much the full model is better (a negative number: worse): mean of the pairs ± their standard "
         f"deviation, pairs won; bold where the mean exceeds two standard errors; in parentheses the paper's difference "
         f"on its subject 394. {_size(study, capital=True)}.\n\n{table(head, rows)}\n"
-        f"PSNR over the box in novel poses, by the distance to the nearest training pose (bins of equally many images, "
+        f"PSNR over the box in novel poses, by the distance to the nearest training pose (bins of equally many frames, "
         f"mean ± standard error over images):\n\n{table(head_extreme, extreme)}"
     )
 

@@ -24,7 +24,7 @@ def test_study_holds_the_numbers_of_all_finished_cells_and_nothing_of_the_others
     assert study["steps"] == {"w/o feat": 7, "Ours": 7}
     assert len(study["cells"]) == 3
     assert study["printed"]["Ours"]["view PSNR"] == [30.68]
-    assert study["extreme"]["bins"]["w/o feat"] == [[5.0, 15.0, 0.0, 1], [5.0, 16.0, 0.0, 1]]
+    assert study["extreme"]["bins"]["w/o feat"] == [[5.0, 15.5, 0.5, 2]]
     assert study["about"] == about
 
 

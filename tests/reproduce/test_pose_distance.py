@@ -34,6 +34,11 @@ def test_bins_hold_all_values_once():
     assert found[1][2] == pytest.approx(10 / math.sqrt(3))
 
 
+def test_images_of_one_frame_share_a_bin():
+    found = binned([8.0, 3.0, 8.0, 3.0, 8.0], [1.0, 5.0, 2.0, 7.0, 3.0], bins=4)
+    assert [(distance, value, count) for distance, value, _, count in found] == [(3.0, 6.0, 2), (8.0, 2.0, 3)]
+
+
 def test_fewer_values_than_bins_are_bins_of_one():
     assert [count for *_, count in binned([1.0, 2.0], [3.0, 4.0], bins=4)] == [1, 1]
     assert binned([], []) == []

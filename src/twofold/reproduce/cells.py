@@ -28,12 +28,14 @@ from twofold.reproduce.sources import FolderSource, Source, StudioSource
 from twofold.training import loop
 from twofold.training.lock import locked
 from twofold.training.perceptual_loss import attach_perceptual
-from twofold.training.run import CHECKPOINT, RECIPE, choose_device
+from twofold.training.run import RECIPE, choose_device
 
 CELLS, CAPTURES = "cells", "captures"
 """Folders of an experiment."""
 CELL, RUN, RESULTS, PROGRESS, FAILURE = "cell.json", "run", "results.json", "progress.json", "failure.json"
 """What a cell's folder holds: what it is, its run, what was measured, how far it is, why it failed."""
+RATE = "rate.json"
+"""Seconds a step of the last training there, kept until the results are."""
 TRAINING_SHARE = 0.85
 """Of a cell's time, for progress; the rest is measuring."""
 EVERY = 1.0
@@ -183,7 +185,8 @@ def train_and_measure(folder: Path) -> None:
     rate: dict[str, float] = {}
 
     def watch(progress: loop.Progress) -> None:
-        first.append(progress.step) if not first else None
+        if not first:
+            first.append(progress.step)
         note(TRAINING_SHARE * progress.step / progress.steps, f"step {progress.step} of {progress.steps}")
         made = progress.step - first[0] + 1
         rate["seconds_per_step"] = (time.monotonic() - begun[0]) / made
@@ -191,12 +194,12 @@ def train_and_measure(folder: Path) -> None:
 
     avatar = loop.train(capture, cell.recipe, run, device, (run / RECIPE).is_file(), watch, attach_perceptual).eval()
     if rate:
-        write_json(folder / "rate.json", rate)
+        write_json(folder / RATE, rate)
     measuring = time.monotonic()
     found = measure_avatar(
         avatar, capture, cell.measures, lambda done: note(TRAINING_SHARE + (1 - TRAINING_SHARE) * done, "measuring")
     )
-    known = read_json(folder / "rate.json") if (folder / "rate.json").is_file() else {}
+    known = read_json(folder / RATE) if (folder / RATE).is_file() else {}
     seconds = (known if isinstance(known, dict) else {}) | {"measuring": time.monotonic() - measuring}
     about = {"recipe": cell.recipe.name, "seed": cell.recipe.seed, "subject": cell.source.name}
     write_json(folder / RESULTS, about | {"seconds": seconds, "measures": asdict(cell.measures)} | found)
@@ -216,11 +219,6 @@ class _Notes:
             beside = self._file.with_suffix(".partial")
             beside.write_text(json.dumps({"share": share, "note": note}), "utf-8")
             os.replace(beside, self._file)
-
-
-def begun(cell: Cell, out: Path) -> bool:
-    """Whether there is a checkpoint to go on from."""
-    return (cell.folder(out) / RUN / CHECKPOINT).is_file()
 
 
 def in_own_process(folder: str, threads: int | None, work: Work | None, parent: int) -> None:

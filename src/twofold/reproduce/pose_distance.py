@@ -36,16 +36,19 @@ def pose_distances(poses: Float[Tensor, "n 24 3"], training: Float[Tensor, "m 24
 
 
 def binned(distances: Sequence[float], values: Sequence[float], bins: int = 4) -> list[tuple[float, float, float, int]]:
-    """Values in bins of equally many distances: middle distance, mean value, its standard error, count.
+    """Values in bins of equally many different distances: mean distance, mean value, its standard error, count.
+
+    Images of one frame by several cameras have one distance, so they share a bin.
 
     >>> binned([1.0, 2.0, 3.0, 4.0], [10.0, 12.0, 20.0, 22.0], bins=2)
     [(1.5, 11.0, 1.0, 2), (3.5, 21.0, 1.0, 2)]
     """
-    ordered = sorted(zip(distances, values, strict=True))
+    places = sorted({round(distance, 4) for distance in distances})
+    bins = min(bins, len(places))
     found: list[tuple[float, float, float, int]] = []
-    bins = min(bins, len(ordered))
     for number in range(bins):
-        part = ordered[len(ordered) * number // bins : len(ordered) * (number + 1) // bins]
+        own = set(places[len(places) * number // bins : len(places) * (number + 1) // bins])
+        part = [(d, value) for d, value in zip(distances, values, strict=True) if round(d, 4) in own]
         count = len(part)
         mean = sum(value for _, value in part) / count
         variance = sum((value - mean) ** 2 for _, value in part) / (count - 1) if count > 1 else 0.0
