@@ -117,7 +117,7 @@ def test_progress_goes_to_the_end_and_no_further(trained, tmp_path):
     assert shares == sorted(shares)
     assert shares[-1] == pytest.approx(1)
     assert all(before < 1 for before in shares[:-1])
-    sections = {name for name in metrics if name not in ("pose_refinement", "cost")}
+    sections = {name for name in metrics if name not in ("pose_refinement", "cost", "coverage")}
     assert {what for _, what in told} == sections | {"pose refinement"}
 
 

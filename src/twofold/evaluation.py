@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from twofold.capture.coverage import coverage_of
 from twofold.capture.types import Capture, Frame, spread
 from twofold.capture.validate import read_mesh
 from twofold.files import write_json
@@ -16,6 +17,8 @@ from twofold.metrics import image as image_metrics
 from twofold.metrics import shape as shape_metrics
 from twofold.metrics import video as video_metrics
 from twofold.metrics.protocols import Networks, ProtocolMeans
+from twofold.outputs.coverage_error import PROTOCOL as COVERAGE_PROTOCOL
+from twofold.outputs.coverage_error import CoverageErrors
 from twofold.outputs.mesh import posed_surface
 from twofold.outputs.shares import Shares
 from twofold.outputs.views import RenderedImage, render_image
@@ -321,6 +324,8 @@ def measure(
         shares.done(what)
 
     metrics: dict[str, object] = {}
+    coverage = coverage_of(capture)
+    errors = CoverageErrors(capture, coverage)
     for split in ("novel_view", "novel_pose"):
         means = ProtocolMeans(networks) if networks else None
 
@@ -329,6 +334,8 @@ def measure(
                 add_picture(means, capture, frame, image)
             if rendered:
                 rendered(split, frame, image)
+            if split == "novel_view":
+                errors.add(frame, image)
             count(split)
 
         part = measure_split(avatar, capture, split, most, True, seen)
@@ -336,6 +343,7 @@ def measure(
             metrics[split] = part
         if means and part:
             metrics[f"{split}_protocols"] = means.figures() | {"protocol": means.protocols()}
+    metrics["coverage"] = {"surface": coverage.share, **errors.metrics(), "protocol": COVERAGE_PROTOCOL}
     metrics["train"] = trained = measure_split(avatar, capture, "train", few, True, lambda f, p: count("train"))
     geometry = measure_geometry(avatar, capture, meshes, progress=lambda: count("geometry"))
     if geometry:

@@ -32,9 +32,19 @@ def trained_by(field, x, pose, turns):
     return {"x": torch.autograd.grad(loss, x, retain_graph=True)[0], **parameter_gradients(field, loss)}
 
 
-@pytest.mark.parametrize("count", [1, TILE, 2 * TILE + 37])
-def test_values_and_gradients_of_any_number_of_samples_are_those_of_the_twin(count):
-    field, twin = off_the_start(make(SMALL)), off_the_start(make(SMALL)).double()
+def partly_observed(field):
+    """The field with a measure of observation that changes from node to node."""
+    field.make_observable()
+    observed = field.get_buffer("observed")
+    field.load_state_dict({"observed": torch.linspace(-1, 2, len(observed)).clamp(0, 1)}, strict=False)
+    return field
+
+
+@pytest.mark.parametrize(
+    ("count", "change"), [(1, lambda f: f), (TILE, lambda f: f), (2 * TILE + 37, lambda f: f), (99, partly_observed)]
+)
+def test_values_and_gradients_of_any_number_of_samples_are_those_of_the_twin(count, change):
+    field, twin = change(off_the_start(make(SMALL))), change(off_the_start(make(SMALL))).double()
     x, pose, turns = points(count)
     found, expected = trained_by(field, x, pose, turns), trained_by(twin, x.double(), pose.double(), turns.double())
     for name, gradient in expected.items():

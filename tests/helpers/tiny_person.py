@@ -129,6 +129,7 @@ def tiny_recipe(steps: int = 100, **training: object) -> Recipe:
         losses=replace(start.method.losses, eikonal_points=64),
         pose=replace(start.method.pose, zero_until=3, refine_from=4, refine=("root", "body", "translation", "shape")),
         shell_refresh=12,
+        completion=replace(start.method.completion, start=5, every=8, points=64),
     )
     settings = {"steps": steps, "images_per_step": 1, "warmup": 3, "checkpoint_every": 10, "preview_every": 0}
     settings["pixels"] = replace(start.training.pixels, rays=256)

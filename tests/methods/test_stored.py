@@ -34,13 +34,14 @@ def test_settings_that_a_stored_recipe_lacks_are_what_was_done_before(name):
     assert table.keys() - added.keys() == (sampler if name == "quick" else set())
 
 
-def test_quick_of_then_is_quick_of_now_but_for_two_settings():
+def test_quick_of_then_is_quick_of_now_but_for_three_settings():
     stored = json.loads((STORED / "quick.json").read_text())
     read = recipe_from_dict(stored, "here")
     losses = dataclasses.replace(read.method.losses, base_mask=0.3)  # since then the base branch has a mask term
     # Since then corrections leave alone what no camera sees.
     pose = dataclasses.replace(read.method.pose, observed_only=True)
-    assert dataclasses.replace(read, method=dataclasses.replace(read.method, losses=losses, pose=pose)) == quick()
+    method = dataclasses.replace(read.method, losses=losses, pose=pose).completing(on=True)
+    assert dataclasses.replace(read, method=method) == quick()
 
 
 def test_a_recipe_of_now_is_complete():

@@ -44,7 +44,15 @@ def written(trained, person_folder: Path, tmp_path_factory: pytest.TempPathFacto
 
 def test_page_shows_the_run(written: tuple[Path, Page]) -> None:
     _, page = written
-    headings = ["The character", "Novel views", "Novel poses", "Canonical space", "Two branches", "Training"]
+    headings = [
+        "The character",
+        "Novel views",
+        "Novel poses",
+        "Canonical space",
+        "Two branches",
+        "Coverage",
+        "Training",
+    ]
     for words in [*headings, "All metrics, and how they were measured", "Recipe, and how to reproduce this"]:
         assert words in page.text, words
     assert "Renderer: the baked mesh, rasterized" in page.text

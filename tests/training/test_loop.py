@@ -16,6 +16,7 @@ import torch
 from small_recipes import CASES
 from tiny_person import Run, tiny_recipe
 
+from twofold.capture.coverage import coverage_of
 from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.recipe import Recipe
@@ -188,8 +189,10 @@ def test_networks_run_compiled_where_the_recipe_asks_for_it_and_the_run_says_so(
     monkeypatch.setattr(torch, "compile", compile_)
     avatar = train(person, dense(1, choice), tmp_path / "run", CPU, say=said.append)
     assert wanted == [{"dynamic": True}] * (3 if compiled else 0)
+    notes = [COMPILED] * compiled
     assert set(ran) == ({"forward", "sdf", "distance_and_gradient"} if compiled else set())
-    assert said == json.loads((tmp_path / "run" / "run.json").read_text())["notes"] == [COMPILED] * compiled
+    assert said == [*notes, coverage_of(person).sentence()]
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["notes"] == notes
     assert not {"forward", "sdf"} & set(vars(avatar.field))
 
 
@@ -199,7 +202,7 @@ def test_feature_grids_have_nothing_to_compile_and_the_run_says_so(
     monkeypatch.setattr(torch, "compile", None)
     said: list[str] = []
     train(person, recipe_of(1, compile="always"), tmp_path / "run", CPU, say=said.append)
-    assert said == [NOTHING_COMPILED]
+    assert said == [NOTHING_COMPILED, coverage_of(person).sentence()]
 
 
 COMPILING = """

@@ -81,7 +81,7 @@ UNREHEARSED = (
 
 
 def choreograph(
-    seed: int, rehearsed: int, unrehearsed: int
+    seed: int, rehearsed: int, unrehearsed: int, yaw_range: float | None = None
 ) -> tuple[Float[np.ndarray, "T 24 3"], Float[np.ndarray, "T 2"]]:
     """Poses of all frames, and how far the body sways sideways and ahead.
 
@@ -89,6 +89,7 @@ def choreograph(
         seed: another seed, another order and other angles.
         rehearsed: frames of the training motion; the body turns twice about itself.
         unrehearsed: frames of the unseen motion, which follows.
+        yaw_range: the body turns to and fro within this angle about +z instead, in the training motion; degrees.
 
     Returns:
         Axis-angle poses (radians, SMPL's T-pose is zero) and offsets (metres).
@@ -99,9 +100,9 @@ def choreograph(
     second = [UNREHEARSED[i] for i in random.permutation(len(UNREHEARSED))][: max(3, unrehearsed // 2)]
     start = random.uniform(-20, 20)
     angles = np.concatenate([_blend(first, rehearsed, random), _blend(second, unrehearsed, random)])
-    turn = np.concatenate(
-        [start + 720 * np.arange(rehearsed) / rehearsed, start + 200 + 300 * np.arange(unrehearsed) / unrehearsed]
-    )
+    share = np.arange(rehearsed) / rehearsed
+    trained = start + 720 * share if yaw_range is None else 0.5 * yaw_range * np.sin(4 * np.pi * share)
+    turn = np.concatenate([trained, start + 200 + 300 * np.arange(unrehearsed) / unrehearsed])
     time = np.arange(len(angles)) / 12
     sway = np.stack([0.03 * np.sin(time * 1.7 + seed), 0.025 * np.sin(time * 1.3 + 1 + seed)], -1)
     return stance_poses(angles, turn), sway

@@ -13,6 +13,9 @@ from PIL import Image, ImageOps
 from scipy import ndimage
 
 from twofold.body.skeleton import ShapedBody, shape_body
+from twofold.capture.coverage import coverage_of
+from twofold.capture.coverage_map import CAPTION as COVERAGE
+from twofold.capture.coverage_map import coverage_map
 from twofold.capture.types import Capture, Frame, spread
 from twofold.check.findings import Judgement, counted
 from twofold.check.frame_measures import FrameFacts, look_at, read_bytes, side_of_faces
@@ -144,6 +147,10 @@ def _page(facts: Facts, capture: Capture, judgement: Judgement) -> bytes:
             "svg": bars_svg("How far limbs turn", _limbs(motion.ranges), 180, 45, "°"),
             "beside": counted(motion.poses, "different pose"),
         },
+        coverage={
+            "image": embedded_image(coverage_map(capture, coverage_of(capture)), COVERAGE, "jpeg"),
+            "sentence": coverage_of(capture).sentence(),
+        },
         cameras=_cameras(facts),
         credit=facts.credit,
     )
@@ -166,6 +173,7 @@ def _key_metrics(facts: Facts) -> list[KeyMetric]:
         KeyMetric("Body on mask", f"{mean:.2f}", "IoU", f"{GOOD_IOU:g} or more", mean >= GOOD_IOU),
         KeyMetric("Badly fitted", f"{bad}", f"of {len(ious)}", "none", bad == 0),
         KeyMetric("Sides seen", f"{facts.motion.seen:.0f}", "degrees", f"{SEEN:g} or more", facts.motion.seen >= SEEN),
+        KeyMetric("Coverage", f"{100 * facts.coverage:.0f}", "% of the surface"),
         KeyMetric("Training images", f"{facts.images['train']}"),
         KeyMetric("Height", f"{facts.stature:.2f}" if facts.stature < 100 else f"{facts.stature:.0f}", "m"),
     ]

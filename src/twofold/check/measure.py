@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.skeleton import ShapedBody, shape_body
+from twofold.capture.coverage import coverage_of
 from twofold.capture.folder import capture_of
 from twofold.capture.layout import Contents, read_contents, spans
 from twofold.capture.types import Capture, Frame, spread
@@ -99,6 +100,7 @@ class Facts:
         elsewhere: camera and time of images that show the pose of another frame, and that frame.
         twins: test images whose bytes equal a training image's: split, camera, time.
         repeated: training frames whose image equals the one before.
+        coverage: share of the body's surface that training images show well.
     """
 
     name: str
@@ -119,6 +121,7 @@ class Facts:
     elsewhere: tuple[tuple[str, int, int], ...]
     twins: tuple[tuple[str, str, int], ...]
     repeated: tuple[int, ...]
+    coverage: float
 
 
 def measure_capture(
@@ -192,6 +195,7 @@ def measure_capture(
         elsewhere=tuple(elsewhere),
         twins=_twins(capture),
         repeated=_repeated(capture.train),
+        coverage=coverage_of(capture).share,
     )
     progress(1.0)
     return facts, capture

@@ -19,6 +19,7 @@ def studio(
     pose_noise: float = 0.0,
     mask_noise: float = 0.0,
     background: Literal["black", "textured"] = "black",
+    yaw_range: float | None = None,
 ) -> None:
     """Make a capture of a synthetic subject, with ground truth of shape and pose.
 
@@ -31,10 +32,12 @@ def studio(
         pose_noise: Error of the given poses, radians (standard deviation).
         mask_noise: Faults of the masks, 0 to 1.
         background: What stands behind the person.
+        yaw_range: Training images show the person from directions within this angle about the front, degrees; by
+            default it turns twice about itself.
     """
     from twofold.studio.generate import StudioConfig, make_studio
 
-    config = StudioConfig(seed, size, frames, cameras, pose_noise, mask_noise, background)
+    config = StudioConfig(seed, size, frames, cameras, pose_noise, mask_noise, background, yaw_range=yaw_range)
     with bar("Filming") as progress:
         make_studio(config, out, lambda done: progress(done, ""))
     say(f"The capture is in {out}.", f"twofold train {out}")
@@ -139,6 +142,7 @@ def check(
         progress(1.0, "")
     for finding in judgement.findings:
         console().print(f"{finding.level}: {finding}", soft_wrap=True)
+    console().print(f"{100 * facts.coverage:.0f} % of the surface is shown well by training images.", soft_wrap=True)
     console().print(judgement.words, soft_wrap=True)
     if write_splits and judgement.unfit:
         left = leave_out(capture, judgement.unfit)

@@ -50,6 +50,7 @@ def train(
     body: Path | None = None,
     split: SplitName | None = None,
     live: Annotated[LiveView, tyro.conf.OmitArgPrefixes] = NO_VIEW,
+    complete: Literal["on", "off"] | None = None,
 ) -> None:
     """Train an avatar from a capture folder.
 
@@ -66,9 +67,10 @@ def train(
         body: Your own SMPL file, for a data set.
         split: Whose training and test images, for a data set.
         live: A viewer in the browser.
+        complete: Whether regions that no training image shows are completed; by default as the recipe has it.
     """
     if settings:
-        _show_settings(recipe, set, seed)
+        _show_settings(recipe, set, seed, complete)
         return
     from twofold.capture.folder import read_capture
     from twofold.capture.validate import require, validate
@@ -78,11 +80,12 @@ def train(
     from twofold.training.run import RECIPE, choose_device, find_capture, read_recipe
 
     if resume is None:
-        chosen, folder, source = _new_run(capture, out, recipe, set, seed, body, split)
-    elif set or out or seed or recipe != "quick" or body or split:
+        wanted = _chosen_recipe(recipe, set, seed, complete)
+        chosen, folder, source = _new_run(capture, out, recipe, wanted, body, split)
+    elif set or out or seed or recipe != "quick" or body or split or complete:
         raise TwofoldError(
-            "--resume continues a run as it was begun; leave --set, --out, --seed, --recipe, --body and --split out, "
-            "or start a new run."
+            "--resume continues a run as it was begun; leave --set, --out, --seed, --recipe, --body, --split and "
+            "--complete out, or start a new run."
         )
     else:
         require_run(resume)
@@ -116,36 +119,37 @@ def _note(done: "Progress") -> str:
     return f"step {done.step}  loss {sum(done.losses.values()):.4f}  {done.psnr:.1f} dB"
 
 
-def _show_settings(recipe: str, overrides: tuple[str, ...], seed: int) -> None:
+def _show_settings(recipe: str, overrides: tuple[str, ...], seed: int, complete: str | None) -> None:
     """Every setting on a line of standard output."""
     from twofold.config import describe
-    from twofold.methods.table import RECIPES, with_settings
 
-    print("\n".join(describe(with_settings(RECIPES[recipe](), [f"seed={seed}", *overrides]))))
+    print("\n".join(describe(_chosen_recipe(recipe, overrides, seed, complete))))
+
+
+def _chosen_recipe(name: str, overrides: tuple[str, ...], seed: int, complete: str | None) -> "Recipe":
+    """A recipe with what the command line changes in it."""
+    from twofold.methods.table import RECIPES, with_completion, with_settings
+
+    recipe = RECIPES[name]()
+    if complete is not None:
+        recipe = with_completion(recipe, complete == "on")
+    return with_settings(recipe, [f"seed={seed}", *overrides])
 
 
 def _new_run(
-    capture: Path | None,
-    out: Path | None,
-    recipe: str,
-    overrides: tuple[str, ...],
-    seed: int,
-    body: Path | None,
-    split: SplitName | None,
+    capture: Path | None, out: Path | None, name: str, recipe: "Recipe", body: Path | None, split: SplitName | None
 ) -> "tuple[Recipe, Path, Path]":
     """Recipe, folder and capture of a run to begin."""
-    from twofold.methods.table import RECIPES, with_settings
     from twofold.training.run import require_free
 
     if capture is None:
         raise TwofoldError("Expected a capture folder (`twofold train CAPTURE`) or --resume RUN; neither was given.")
-    settings = with_settings(RECIPES[recipe](), [f"seed={seed}", *overrides])
     if out is not None:
         require_free(out)
     capture = capture_from(capture, body, split)
-    folder = out or Path("runs") / f"{capture.resolve().name}-{recipe}"
+    folder = out or Path("runs") / f"{capture.resolve().name}-{name}"
     require_free(folder)
-    return settings, folder, capture
+    return recipe, folder, capture
 
 
 def render(

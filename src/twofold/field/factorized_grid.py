@@ -23,8 +23,13 @@ from twofold.field.grids import (
     build_lattices,
     interpolate,
     interpolation_pullback,
+    node_positions,
 )
 from twofold.field.output import FieldOutput
+from twofold.geometry.surfaces import nearest_vertices
+
+UNOBSERVED, OBSERVED = 0.1, 0.5
+"""How well the surface has to be observed for the pose-dependent branch to have any effect, and its whole effect."""
 
 
 @dataclass(frozen=True)
@@ -180,8 +185,10 @@ class GridField(nn.Module):
         """Distances and features of both branches; `slopes` says whether their gradients by x are wanted too."""
         g = _Geometry(self.pose_code(pose) if hasattr(self, "pose_code") else None)
         body = self.get_buffer("prior")
-        lattices = Lattices(*(self.get_buffer(f"prior_{name}") for name in ("rows", "place", "shape")))
-        prior = interpolate(body, x, lattices)[:, 0]
+        lattices = self._prior_lattices
+        # With a second column, how well the surface there was observed.
+        known = interpolate(body, x, lattices)
+        prior = known[:, 0]
         tape = tape2 = (x, x)
         if self.has_low:
             g.low = self.low_grid(x)
@@ -199,6 +206,8 @@ class GridField(nn.Module):
             g.s = g.s1
         else:
             g.gate = self._gate(g.s1)
+            if known.shape[1] > 1:
+                g.gate = g.gate * known[:, 1].detach()
             g.s = g.s1 + g.gate * g.s2
         if slopes == "none":
             return g
@@ -206,7 +215,9 @@ class GridField(nn.Module):
             # The reverse pass, by hand: head, networks, grids.
             head = torch.zeros(len(x), 1 + self.config.shared, dtype=x.dtype, device=x.device)
             head[:, 0] = 0.1
-            slope = interpolation_pullback(body, x, torch.ones_like(prior)[:, None], lattices)
+            only_prior = torch.zeros_like(known)
+            only_prior[:, 0] = 1
+            slope = interpolation_pullback(body, x, only_prior, lattices)
             if self.has_low:
                 g.g1 = slope + self.low_grid.pullback(x, self.low_sdf.pullback(tape, head)[:, : self.low_grid.size])
                 g.g = g.g1
@@ -227,7 +238,7 @@ class GridField(nn.Module):
             return None
         code = self.pose_code(pose)
         nets = tuple(net.at(code) for net in (self.low_sdf, self.low_color, self.high_sdf, self.high_color))
-        prior = Lattices(*(self.get_buffer(f"prior_{name}") for name in ("rows", "place", "shape")))
+        prior = self._prior_lattices
         width = float("inf") if config.gate_width is None else config.gate_width
         lattices = (prior, self.low_grid.lattices, self.high_grid.lattices)
         tables = (self.get_buffer("prior"), self.low_grid.table, self.high_grid.table)
@@ -281,6 +292,71 @@ class GridField(nn.Module):
         g = self._geometry(x, pose, "none")
         base, plain = self._unlit_colors(x, g)
         return self._output(FieldOutput(g.s, plain, None), None if base is None else FieldOutput(g.s1, base, None))
+
+    def base_unlit(self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> FieldOutput:
+        """Distance and colour of the branch that is the same in every frame, without light; no gradients by x."""
+        if not self.has_low:
+            return self.unlit(x, pose)
+        code = self.pose_code(pose) if hasattr(self, "pose_code") else None
+        features = self.low_grid(x)
+        answer, _ = self.low_sdf(features, code)
+        color, _ = self.low_color(torch.cat([features, answer[:, 1:]], -1), code)
+        prior = interpolate(self.get_buffer("prior")[:, :1].contiguous(), x, self._prior_lattices)[:, 0]
+        return FieldOutput(prior + 0.1 * answer[:, 0], torch.sigmoid(color[:, :3]), None)
+
+    def light_bend(self) -> Float[Tensor, ""]:
+        r"""Squared size of the part of the law of light that is quadratic in the normal.
+
+        A camera that stands still sees normals of one hemisphere, on which $z$ and $z^2$ look alike. A diffuse surface
+        under a light from one side is nearly linear in the normal, and so the other hemisphere is dark where this one
+        is bright.
+        """
+        squares, mixed = self.light.weight[:, 3:6], self.light.weight[:, 6:]
+        return (squares - squares.mean(1, keepdim=True)).square().sum() + 0.5 * mixed.square().sum()
+
+    @property
+    def _prior_lattices(self) -> Lattices:
+        return Lattices(*(self.get_buffer(f"prior_{name}") for name in ("rows", "place", "shape")))
+
+    def make_observable(self) -> None:
+        """Gives the field a measure of how well it was observed, everywhere for now; part of its state from then on.
+
+        Where nothing was observed the pose-dependent branch has no effect and its features stay zero.
+        """
+        self.register_buffer("observed", torch.ones(len(self.get_buffer("prior"))))
+        self._take_observed()
+        if self.has_high:
+            self.high_grid.table.register_hook(self._of_observed)
+        # A loaded state has a measure of its own.
+        self.register_load_state_dict_post_hook(lambda field, _: field._take_observed())
+
+    def observe(self, vertices: Float[Tensor, "V 3"], weight: Float[Tensor, "V"]) -> None:
+        """Takes on how well each vertex of the canonical body was observed, 0..1; needs `make_observable` before."""
+        nodes = node_positions(self._prior_lattices)
+        away, nearest = nearest_vertices(nodes, vertices, min(4, len(vertices)))
+        share = 1 / (away + 1e-3)
+        here = (share * weight.to(away)[nearest]).sum(-1) / share.sum(-1)
+        self.get_buffer("observed").copy_(((here - UNOBSERVED) / (OBSERVED - UNOBSERVED)).clamp(0, 1))
+        self._take_observed()
+        if self.has_high:
+            with torch.no_grad():
+                self.high_grid.table.mul_(self._observed_rows())
+
+    def _take_observed(self) -> None:
+        prior, observed = self.get_buffer("prior"), self.get_buffer("observed")
+        self.register_buffer("prior", torch.stack([prior[:, 0], observed], -1), persistent=False)
+        self._rows: Tensor | None = None
+
+    def _observed_rows(self) -> Tensor:
+        """1 for rows of the fine features that were observed, else 0."""
+        if self._rows is None:
+            nodes = node_positions(self.high_grid.lattices).to(self.high_grid.table)
+            there = interpolate(self.get_buffer("observed")[:, None].contiguous(), nodes, self._prior_lattices)
+            self._rows = (there > 0).to(self.high_grid.table)
+        return self._rows
+
+    def _of_observed(self, gradient: Tensor) -> Tensor:
+        return gradient * self._observed_rows()
 
     def _output(self, whole: FieldOutput, base: FieldOutput | None) -> FieldOutput:
         return replace(whole, base=base) if self.config.branches in ("both", "high_rendered") else whole

@@ -28,7 +28,8 @@ class FusedField:
     """The parameters of a field with both branches at one pose, float32 on the CPU.
 
     Attributes:
-        prior: signed distance to the body at the nodes of its lattices, metres.
+        prior: signed distance to the body at the nodes of its lattices, metres; and, in a second column, how well the
+            surface there was observed, which weakens the gate.
         low: feature table of the low branch.
         high: feature table of the high branch.
         lattices: of prior, low and high grid.
@@ -36,7 +37,7 @@ class FusedField:
         gate_width: metres; infinite for plain sums.
     """
 
-    prior: Float[Tensor, "N 1"]
+    prior: Float[Tensor, "N P"]
     low: Float[Tensor, "L C"]
     high: Float[Tensor, "H C"]
     lattices: tuple[Lattices, Lattices, Lattices]
@@ -139,8 +140,8 @@ def _by_values(
     """Gradients by points (where wanted), law, tables and nets from those by s, s1, c and c1."""
     count = len(given[0])
     by_low, by_high = (torch.empty(count, table.shape[1] * len(at.place)) for table, at in _grids(field))
-    by_prior = torch.empty(count, 1)
-    stored = (by_low.numpy(), by_high.numpy(), by_prior.numpy()[:, 0])
+    by_prior = torch.empty(count)
+    stored = (by_low.numpy(), by_high.numpy(), by_prior.numpy())
 
     def part(begin: int, end: int) -> tuple[list[tuple[np.ndarray, ...]], np.ndarray]:
         by_nets, by_law = _zeros(field), np.zeros((3, 9), np.float32)
@@ -208,6 +209,8 @@ def _scattered(kernel: Callable[..., None], table: Tensor, at: Lattices, *arrays
 def _by_points(field: FusedField, x: np.ndarray, low: Tensor, high: Tensor, prior: Tensor) -> Tensor:
     """Gradient by the points from those by all features."""
     total = torch.zeros(len(x), 3)
+    # What was observed weakens the gate as a constant.
+    prior = torch.nn.functional.pad(prior[:, None], (0, field.prior.shape[1] - 1))
     tables = (field.low, field.high, field.prior)
     lattices = (field.lattices[1], field.lattices[2], field.lattices[0])
     for table, at, cotangent in zip(tables, lattices, (low, high, prior), strict=True):

@@ -132,6 +132,8 @@ def _geometry(x, count, grids, nets, gate_width, inputs, tape, answers, prior, g
         ratio = (prior[s, 0] + _TENTH * answers[0][s, 0]) / gate_width
         square = ratio * ratio
         gate[s] = _ONE / (_ONE + square * square)
+        if prior.shape[1] > 1:  # how well the surface there was observed
+            gate[s] *= prior[s, 1]
     _net_forward(high, nets[2], tape[2], answers[2])
 
 
@@ -185,7 +187,7 @@ def _light(harmonics, law, out):  # noqa: ANN001, ANN202
 def distances(x, grids, nets, gate_width, sdf, begin, end):  # noqa: ANN001, ANN201
     """sdf[S] = the whole field's signed distance."""
     inputs, tape, answers = _buffers(nets, _columns(nets))
-    prior, gate = np.zeros((TILE, 1), np.float32), np.zeros(TILE, np.float32)
+    prior, gate = np.zeros((TILE, grids[0][0].shape[1]), np.float32), np.zeros(TILE, np.float32)
     for first in range(begin, end, TILE):
         count = min(TILE, end - first)
         _geometry(x[first : first + count], count, grids, nets, gate_width, inputs, tape, answers, prior, gate)
@@ -207,7 +209,8 @@ def _gradients(x, count, grids, nets, tape, gate, heads, hidden, by_input, pulle
         for c in range(shared):
             heads[1][s, 1 + c] = gate[s] * by_input[2][s, own + c]
     _net_pullback(heads[1], nets[0], tape[0], hidden[1], by_input[1])
-    ones = np.ones((count, 1), np.float32)
+    ones = np.zeros((count, grids[0][0].shape[1]), np.float32)
+    ones[:, 0] = _ONE
     high = np.empty((count, own), np.float32)
     for s in range(count):
         for c in range(own):
@@ -236,7 +239,7 @@ def forward(  # noqa: ANN201
 ):  # fmt: skip
     """Distances, colours and canonical gradients of the whole and of the low branch; `turn` [S 3 3], `law` [3 9]."""
     inputs, tape, answers = _buffers(nets, _columns(nets))
-    prior, gate = np.zeros((TILE, 1), np.float32), np.zeros(TILE, np.float32)
+    prior, gate = np.zeros((TILE, grids[0][0].shape[1]), np.float32), np.zeros(TILE, np.float32)
     heads, hidden, by_input, pulled = _slope_buffers(nets)
     harmonics, light = np.empty(9, np.float32), np.empty(3, np.float32)
     for first in range(begin, end, TILE):
@@ -276,7 +279,7 @@ def backward(  # noqa: ANN201
     Cotangents of the interpolated features [S LC] and of the prior [S] are stored; those of nets and law are added up.
     """
     inputs, tape, answers = _buffers(nets, _columns(nets))
-    prior, gate = np.zeros((TILE, 1), np.float32), np.zeros(TILE, np.float32)
+    prior, gate = np.zeros((TILE, grids[0][0].shape[1]), np.float32), np.zeros(TILE, np.float32)
     by_inputs, hidden, by_answers = _buffers(nets, _columns(nets))
     harmonics, light = np.empty(9, np.float32), np.empty(3, np.float32)
     shared = nets[0][5].shape[0] - 1
@@ -339,7 +342,7 @@ def backward(  # noqa: ANN201
 def distance_and_gradient(x, grids, nets, gate_width, sdf, gradient, begin, end):  # noqa: ANN001, ANN201
     """The whole field's signed distance [S] and its canonical gradient [S 3]."""
     inputs, tape, answers = _buffers(nets, _columns(nets))
-    prior, gate = np.zeros((TILE, 1), np.float32), np.zeros(TILE, np.float32)
+    prior, gate = np.zeros((TILE, grids[0][0].shape[1]), np.float32), np.zeros(TILE, np.float32)
     heads, hidden, by_input, pulled = _slope_buffers(nets)
     for first in range(begin, end, TILE):
         count = min(TILE, end - first)
@@ -362,7 +365,7 @@ def gradient_backward(  # noqa: ANN201
     the low grid, and with `high_pushed` [S 3], which the gate has weakened, for the high one.
     """
     inputs, tape, answers = _buffers(nets, _columns(nets))
-    prior, gate = np.zeros((TILE, 1), np.float32), np.zeros(TILE, np.float32)
+    prior, gate = np.zeros((TILE, grids[0][0].shape[1]), np.float32), np.zeros(TILE, np.float32)
     heads, hidden, by_input, pulled = _slope_buffers(nets)
     low_in, high_in = np.zeros((TILE, nets[0][0].shape[1]), np.float32), np.zeros_like(inputs[2])
     layers = np.zeros((2, TILE, nets[0][1].shape[0]), np.float32)

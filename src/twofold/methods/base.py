@@ -170,6 +170,19 @@ class MethodConfig(ABC):
     def build(self, subject: Subject, seed: int = 0) -> "Avatar":
         """An untrained avatar of a subject."""
 
+    def completing(self, on: bool) -> "MethodConfig":
+        """The configuration with unobserved regions completed in training, or left as they come.
+
+        Raises:
+            TwofoldError: the method cannot complete them.
+        """
+        if not on:
+            return self
+        raise TwofoldError(
+            f"{type(self).__name__} does not complete unobserved regions; leave --complete on out, or choose another "
+            "--recipe."
+        )
+
 
 class Avatar(nn.Module, ABC, Generic[Own]):
     """A person that can be posed and rendered. Everything above methods uses only what stands here."""

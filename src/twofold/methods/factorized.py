@@ -6,15 +6,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from twofold.capture.types import Capture
 from twofold.config import require
 from twofold.field.factorized import FactorizedField, FactorizedFieldConfig
 from twofold.field.factorized_grid import GridField, GridFieldConfig
 from twofold.field.output import FieldOutput
 from twofold.kernels.runtime import compiled_methods
-from twofold.methods.base import ParameterGroup
+from twofold.methods.base import Batch, Mode, ParameterGroup, Rendering
 from twofold.methods.factorized_config import RateConfig
 from twofold.methods.skinned import Posed, SkinnedAvatar
 from twofold.methods.skinned_config import SkinnedConfig
@@ -49,6 +50,38 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
     def __init__(self, config: FactorizedConfig, subject: Subject, seed: int) -> None:
         """Builds the field around the subject's canonical body."""
         super().__init__(config, subject, seed, config.field.build)
+        if self.completion is not None and isinstance(self.field, GridField):
+            self.field.make_observable()
+
+    def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
+        """See `Avatar.prepare_training`; feature grids switch their residual off where nothing was observed."""
+        super().prepare_training(capture, stage, generator)
+        if self.completion is not None and isinstance(self.field, GridField):
+            self.field.observe(self.canonical_points, self.completion.weight)
+
+    def answer_beside(self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed) -> FieldOutput:
+        """See `SkinnedAvatar.answer_beside`; of feature grids it is without light."""
+        if isinstance(self.field, GridField):
+            return self.field.unlit(x_canonical, posed.own.condition)
+        return super().answer_beside(x_canonical, vertex, posed)
+
+    def completed_beside(
+        self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed
+    ) -> tuple[FieldOutput, ...]:
+        """See `SkinnedAvatar.completed_beside`; of feature grids it is the base branch, as nothing else is there."""
+        if isinstance(self.field, GridField):
+            return (self.field.base_unlit(x_canonical, posed.own.condition),)
+        return super().completed_beside(x_canonical, vertex, posed)
+
+    def losses(
+        self, rendering: Rendering, batch: Batch, posed: Posed, mode: Mode, generator: torch.Generator
+    ) -> dict[str, Float[Tensor, ""]]:
+        """See `Avatar.losses`; with completion, the law of light of feature grids is kept simple."""
+        terms = super().losses(rendering, batch, posed, mode, generator)
+        if self.completion is not None and isinstance(self.field, GridField):
+            weight = self.config.completion.light * self.completion.unobserved
+            terms["completion_light"] = weight * self.field.light_bend()
+        return terms
 
     @property
     def _dense(self) -> bool:

@@ -10,6 +10,7 @@ from twofold.losses import LossConfig
 from twofold.methods.factorized import FactorizedConfig
 from twofold.methods.factorized_config import RateConfig
 from twofold.methods.pose_schedule import PoseConfig
+from twofold.methods.skinned_config import COMPLETING
 from twofold.recipe import PixelConfig, Recipe, TrainingConfig
 from twofold.sampling.error_bounded import ErrorBoundedSampler
 from twofold.sampling.shell_sampler import ShellSampler
@@ -145,6 +146,7 @@ def quick() -> Recipe:
             outliers_in_shading=True,
             scene_scale="metres",
             shell_refresh=400,
+            completion=COMPLETING,
         ),
         training=TrainingConfig(
             steps=4000,

@@ -10,19 +10,21 @@ from dataclasses import replace
 from typing import Generic, Literal, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from twofold.body.skeleton import PosedBody, ShapedBody, movements, pose_body, shape_body
+from twofold.capture.coverage import coverage_of
 from twofold.capture.types import Capture
 from twofold.config import require
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.deform.skinning import normal_matrices, to_canonical, vertex_transforms, weights_by
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
-from twofold.geometry.surfaces import nearest_vertices
+from twofold.geometry.surfaces import nearest_vertices, vertex_normals
 from twofold.methods.base import EVALUATION, Avatar, Batch, Mode, PosedAvatar, Rendering
+from twofold.methods.completion import Completion
 from twofold.methods.loss_terms import loss_terms
 from twofold.methods.pose_schedule import condition
 from twofold.methods.skinned_config import CanonicalField, SkinnedConfig, SkinnedPose
@@ -83,6 +85,10 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         weigh = functools.partial(weights_by, config.falloff, scale=self.scale)
         self.deformation = Deformation(weigh, config.outlier_distance / self.scale, self.scale)
         self._sampler: Sampler = config.sampler.build(self.deformation, canonical.canonical_vertices, canonical.faces)
+        self.completion: Completion | None = None
+        if config.completion.active:
+            normals = vertex_normals(canonical.canonical_vertices, canonical.faces)
+            self.completion = Completion(config.completion, given, canonical.canonical_vertices, normals)
 
     @property
     def _dense(self) -> bool:
@@ -93,6 +99,23 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
     def _two_branches(self) -> bool:
         """Whether a base branch is rendered, too."""
         return False
+
+    def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
+        """See `Avatar.prepare_training`: how well the surface was observed, where it is to be completed."""
+        if self.completion is not None:
+            self.completion.prepare(coverage_of(capture))
+
+    def answer_beside(self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed) -> FieldOutput:
+        """What completion takes its targets from, at canonical points beside these vertices."""
+        turned = normal_matrices(vertex[:, None], torch.ones_like(x_canonical[:, :1]), posed.own.surface.forward)
+        return self.field(x_canonical, posed.own.condition, turned)
+
+    def completed_beside(
+        self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed
+    ) -> tuple[FieldOutput, ...]:
+        """The branches that completion pulls to these targets."""
+        answer = self.answer_beside(x_canonical, vertex, posed)
+        return (answer,) if answer.base is None else (answer, answer.base)
 
     @property
     def wants_perceptual(self) -> bool:
@@ -132,8 +155,12 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         if self.config.late_neighbours is not None and first and epoch and epoch % self.config.late_from == 0:
             self.late_shape.copy_(self.refinement.shape.detach())
         refresh, step = self.config.shell_refresh, mode.step or 0
-        if not self.refinement.parts or step == 0 or step % refresh or step < self.config.pose.refine_from:
-            return
+        if self.refinement.parts and step and step % refresh == 0 and step >= self.config.pose.refine_from:
+            self._refresh_shells()
+        if self.completion is not None and self.completion.is_due(step):
+            self._take_targets(self.completion, mode)
+
+    def _refresh_shells(self) -> None:
         with torch.no_grad():
             self._follow(*self._refined())
 
@@ -168,6 +195,13 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
                 self._observed = observed_corrections(self.subject, capture, pose.refine).to(self.device)
             self.refinement.project(self._observed)
         return "continue"
+
+    @torch.no_grad()
+    def _take_targets(self, completion: Completion, mode: Mode) -> None:
+        """In the first frame's pose, whatever this step shows: so any number of processes find the same."""
+        subject = self.subject
+        posed = self.pose(subject.poses[0], subject.translations[0], int(subject.times[0]), mode)
+        completion.refresh(lambda x, vertex: self.answer_beside(x, vertex, posed))
 
     def pose(
         self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], frame_index: int | None = None,
@@ -313,8 +347,11 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
             return self.field.distance_and_gradient(x_canonical, posed.own.condition)[1]
 
         network = self._perceptual[0] if self._perceptual else None
-        config, vertices = self.config.losses, self.canonical_points
-        return loss_terms(config, rendering, batch, vertices, gradients, network, mode.step or 0, generator)
+        config, vertices, step = self.config.losses, self.canonical_points, mode.step or 0
+        terms = loss_terms(config, rendering, batch, vertices, gradients, network, step, generator)
+        if self.completion is not None:
+            terms |= self.completion.terms(lambda x, v: self.completed_beside(x, v, posed), step, generator)
+        return terms
 
     def level(self, x: Float[Tensor, "S 3"], posed: Posed, branch: str = "full") -> Float[Tensor, "S"]:
         """See `Avatar.level`."""

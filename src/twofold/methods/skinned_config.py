@@ -12,10 +12,14 @@ from twofold.config import require, require_within
 from twofold.field.output import FieldOutput
 from twofold.losses import MAX_STEPS, LossConfig
 from twofold.methods.base import MethodConfig
+from twofold.methods.completion import CompletionConfig
 from twofold.methods.pose_schedule import PoseConfig
 from twofold.sampling.error_bounded import ErrorBoundedSampler
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.shell_sampler import ShellSampler
+
+COMPLETING = CompletionConfig(color=2.0, shape=0.04, light=0.1)
+"""Completion of unobserved regions as `--complete on` asks for it."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,7 @@ class SkinnedConfig(MethodConfig):
     sampler: ErrorBoundedSampler | ShellSampler = dataclasses.field(default_factory=ShellSampler)
     losses: LossConfig = dataclasses.field(default_factory=LossConfig)
     pose: PoseConfig = dataclasses.field(default_factory=PoseConfig)
+    completion: CompletionConfig = dataclasses.field(default_factory=CompletionConfig)
     neighbours: int = 1
     """How many nearest vertices give a point its skinning weights."""
     late_neighbours: int | None = None
@@ -58,6 +63,12 @@ class SkinnedConfig(MethodConfig):
             shell_refresh=(1, MAX_STEPS), outlier_distance=(0.001, 10), beta=(0, 10),
         )  # fmt: skip
         require(0 < self.beta_floor < self.beta, f"beta_floor should lie between 0 and beta={self.beta}")
+
+    def completing(self, on: bool) -> "SkinnedConfig":
+        """See `MethodConfig.completing`."""
+        if on == self.completion.active:
+            return self
+        return dataclasses.replace(self, completion=COMPLETING if on else CompletionConfig())
 
 
 class CanonicalField(Protocol):

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 from twofold.config import KIND, from_dict, to_dict, with_overrides
@@ -88,6 +88,16 @@ def learning_rates(recipe: Recipe) -> dict[str, float]:
     {'method.rates.all': 0.0005}
     """
     return {f"method.rates.{name}": rate for name, rate in to_dict(recipe.method.rates).items()}
+
+
+def with_completion(recipe: Recipe, on: bool) -> Recipe:
+    """The recipe with unobserved regions completed, or left as they come.
+
+    Raises:
+        TwofoldError: its method cannot complete them.
+    """
+    method = cast(MethodConfig, recipe.method).completing(on)
+    return replace(recipe, method=method)
 
 
 def _renamed(data: dict[str, Any]) -> dict[str, Any]:

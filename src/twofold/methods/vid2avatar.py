@@ -180,6 +180,7 @@ class Vid2Avatar(SkinnedAvatar[Vid2AvatarConfig, ImplicitField]):
 
     def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
         """See `Avatar.prepare_training`: the distance becomes that of the canonical body."""
+        super().prepare_training(capture, stage, generator)
         prefit, size = self.config.prefit, len(self._no_pose())
         if prefit is not None:
             body = self.canonical_points.cpu(), self.subject.body.faces

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from twofold.capture.coverage_map import CAPTION, coverage_map
 from twofold.capture.types import Capture
 from twofold.config import list_settings
 from twofold.evaluation import with_protocols
@@ -15,6 +16,7 @@ from twofold.recipe import Recipe
 from twofold.report import page_images as own
 from twofold.report.page_character import PageCharacter
 from twofold.report.parts import (
+    CaptionedImage,
     Chart,
     Commands,
     Curve,
@@ -29,7 +31,7 @@ from twofold.report.parts import (
     write_report,
 )
 from twofold.training.curves import read_curves
-from twofold.training.run import CURVES, read_about, read_recipe
+from twofold.training.run import CURVES, read_about, read_coverage, read_recipe
 
 Progress = Callable[[float, str], None]
 
@@ -147,6 +149,7 @@ def write_page(
             (images.canonical,),
         ),
         *_branches_section(images),
+        _coverage_section(run, capture),
         *_curves_section(run),
         _metrics_section(metrics),
         _recipe_section(run, recipe, texts),
@@ -194,6 +197,12 @@ def _branches_section(images: PageImages) -> list[Section]:
         "with the pose. Their sum is the avatar. Residuals are shown around grey."
     )
     return [Section("Two branches", text, tuple(rows))] if rows else []
+
+
+def _coverage_section(run: Path, capture: Capture) -> Section:
+    coverage = read_coverage(run, capture)
+    text = f"{coverage.sentence().capitalize()}. {CAPTION}"
+    return Section("Coverage", text, (Row((CaptionedImage(coverage_map(capture, coverage)),)),))
 
 
 def _curves_section(run: Path) -> list[Section]:

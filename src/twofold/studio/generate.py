@@ -48,6 +48,8 @@ class StudioConfig:
         mask_noise: faults of the masks, from 0 (exact) to 1 (bad).
         background: behind the person.
         samples: along each side of a pixel, against jagged edges.
+        yaw_range: the training motion shows the first camera only directions within this angle about the front,
+            degrees; None: the person turns twice about itself.
     """
 
     seed: int = 0
@@ -58,6 +60,7 @@ class StudioConfig:
     mask_noise: float = 0.0
     background: Literal["black", "textured"] = "black"
     samples: int = 3
+    yaw_range: float | None = None
 
     def __post_init__(self) -> None:
         limits = {
@@ -72,6 +75,8 @@ class StudioConfig:
                 raise TwofoldError(
                     f"{name} of a studio capture should be {low} to {high}, it is {getattr(self, name)}."
                 )
+        if self.yaw_range is not None and not 0 <= self.yaw_range <= 360:
+            raise TwofoldError(f"yaw_range of a studio capture should be 0 to 360 degrees, it is {self.yaw_range}.")
         for name in ("pose_noise", "mask_noise"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TwofoldError(f"{name} of a studio capture should be 0 to 1, it is {getattr(self, name)}.")
@@ -113,13 +118,14 @@ class Performer:
     translations: Float[np.ndarray, "T 3"]
 
 
-def cast(seed: int, rehearsed: int, unrehearsed: int) -> Performer:
+def cast(seed: int, rehearsed: int, unrehearsed: int, yaw_range: float | None = None) -> Performer:
     """Draw a person and a motion.
 
     Args:
         seed: another seed, another person.
         rehearsed: frames of the training motion.
         unrehearsed: frames of the unseen motion.
+        yaw_range: see `StudioConfig`.
     """
     body = anny_body()
     random = np.random.default_rng([seed, 0])
@@ -127,7 +133,7 @@ def cast(seed: int, rehearsed: int, unrehearsed: int) -> Performer:
     shaped = shape_body(body, betas)
     look = sample_look(seed)
     figure = build_figure(shaped, look)
-    poses, sway = choreograph(seed, rehearsed, unrehearsed)
+    poses, sway = choreograph(seed, rehearsed, unrehearsed, yaw_range)
     poses = poses.astype(np.float32)
     # The naked body's lowest point stands for the soles, which are 1.6 cm thick.
     lowest = [_posed(shaped, pose, np.zeros(3)).vertices[:, 1].min().item() - 0.016 for pose in poses]
@@ -211,7 +217,7 @@ def make_studio(
     torch.set_num_threads(1)
     try:
         with CaptureWriter(out, overwrite) as writer:
-            performer = cast(config.seed, rehearsed, config.frames - rehearsed)
+            performer = cast(config.seed, rehearsed, config.frames - rehearsed, config.yaw_range)
             cameras = ring(config.cameras, config.size, _outline(performer))
             _film(config, performer, cameras, splits, writer, progress or (lambda _: None))
             given_poses, given_translations = _disturbed(config, performer)

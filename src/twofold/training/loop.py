@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from twofold import losses
+from twofold.capture.coverage import coverage_of
 from twofold.capture.types import Capture, Frame
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors
@@ -198,10 +199,10 @@ def train(
         if wants_compiling(config, device):
             notes.append(COMPILED if at_the_end.enter_context(avatar.compiled()) else NOTHING_COMPILED)
         if say and team.leads:
-            for note in notes:
+            for note in [*notes, *([] if resume else [coverage_of(capture).sentence()])]:
                 say(note)
         if not resume and team.leads:
-            start_folder(folder, recipe, subject, capture.folder, tuple(notes))
+            start_folder(folder, recipe, subject, capture.folder, tuple(notes), coverage_of(capture))
             if not begun:
                 at_the_end.enter_context(locked(folder))
         clock = Clock(folder / CHECKPOINT if resume else None)
@@ -302,8 +303,7 @@ class _Run:
         load_optimizer(self.optimizer, tensors)
 
     def _enter(self, stage: int, prepared: bool) -> None:
-        self.current = stage
-        chosen, frames = self.stages[stage], self.capture.train
+        self.current, chosen, frames = stage, self.stages[stage], self.capture.train
         if not prepared:
             generator = torch.Generator().manual_seed(mixed(self.seed, 11, stage, self.restarts))
             self.avatar.prepare_training(self.capture, stage, generator)

@@ -16,6 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from twofold import __version__
+from twofold.capture.coverage import Coverage, coverage_of
 from twofold.capture.layout import DESCRIPTION
 from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
@@ -28,8 +29,8 @@ from twofold.npz import read_npz
 from twofold.recipe import Recipe
 from twofold.training.clock import Spent
 
-RECIPE, ABOUT, SUBJECT, CHECKPOINT, CURVES = (
-    "recipe.json", "run.json", "subject.npz", "checkpoint.safetensors", "curves.csv",
+RECIPE, ABOUT, SUBJECT, COVERAGE, CHECKPOINT, CURVES = (
+    "recipe.json", "run.json", "subject.npz", "coverage.npz", "checkpoint.safetensors", "curves.csv",
 )  # fmt: skip
 """What a run folder holds. The recipe is written last, so a folder that has one has all it takes to begin."""
 _DAMAGED = "is damaged; train again"
@@ -85,8 +86,11 @@ def require_free(folder: Path) -> None:
             raise TwofoldError(f"{folder} holds files that are no run; choose another --out.")
 
 
-def start_folder(folder: Path, recipe: Recipe, subject: Subject, capture: Path, notes: tuple[str, ...] = ()) -> None:
-    """Writes what a run is: recipe, subject, versions, where its capture lies, what there is to note.
+def start_folder(
+    folder: Path, recipe: Recipe, subject: Subject, capture: Path, notes: tuple[str, ...] = (),
+    coverage: Coverage | None = None,
+) -> None:  # fmt: skip
+    """Writes what a run is: recipe, subject, versions, where its capture lies, what there is to note; its coverage.
 
     Raises:
         TwofoldError: see `require_free`; or the disk refuses.
@@ -106,6 +110,8 @@ def start_folder(folder: Path, recipe: Recipe, subject: Subject, capture: Path, 
 
     def fill(place: Path) -> None:
         write_npz(place / SUBJECT, subject.arrays())
+        if coverage is not None:
+            write_npz(place / COVERAGE, coverage.arrays())
         write_json(place / ABOUT, about)
         write_json(place / RECIPE, recipe_to_dict(recipe))
 
@@ -202,6 +208,21 @@ def read_subject(folder: Path) -> Subject:
     """
     file = folder / SUBJECT
     return Subject.from_arrays(read_npz(file), str(file))
+
+
+def read_coverage(folder: Path, capture: Capture) -> Coverage:
+    """How well the training images of a run observed the surface; of a run that has not stored it, from its capture.
+
+    Raises:
+        TwofoldError: it is damaged.
+    """
+    file = folder / COVERAGE
+    if not is_there(file):
+        return coverage_of(capture)
+    coverage = Coverage.from_arrays(read_npz(file), str(file))
+    if len(coverage.weight) != len(capture.body.template):
+        raise TwofoldError(f"{file} belongs to another body than {capture.folder} has; train again.")
+    return coverage
 
 
 def load(folder: Path, device: torch.device | str = "cpu") -> tuple[Avatar, int]:

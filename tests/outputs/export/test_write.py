@@ -114,7 +114,7 @@ def test_files_agree_with_twofolds_skinning_and_say_what_is_in_them(
     record = json.loads((tmp_path / "exports" / write.RECORD).read_text())
     assert record["watertight"] is True
     assert record["files"]["avatar.glb"] == written[0].stat().st_size
-    assert 0.2 < record["observed_share"] <= 1
+    assert 0.2 < record["coverage"] <= 1
 
 
 def test_clip_starts_over_the_origin_with_its_lowest_point_on_the_ground(baked: Baked, person: Capture) -> None:

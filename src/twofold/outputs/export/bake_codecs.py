@@ -23,7 +23,7 @@ class BakedColors:
 
     Attributes:
         colors: of the vertices, sRGB, 0..1.
-        observed: share of the training frames that saw each vertex.
+        observed: how well training images observed each vertex, 0..1.
         texture: sRGB; None for vertex colours alone.
         normal_map: tangent space; None where there is none.
     """

@@ -47,7 +47,7 @@ class Character:
         texture: sRGB.
         normal_map: tangent space, as glTF has it.
         lit: colours hold the capture's light, so viewers should add none.
-        observed: share of the training frames that saw each vertex, 0..1; None where it was not measured.
+        observed: how well training images observed each vertex, 0..1; None where it was not measured.
         rigged: False for a still mesh, whose vertices are in the world and which has neither targets nor clips.
     """
 

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from twofold.capture.coverage import coverage_of, weights_at
 from twofold.capture.types import Capture, Frame, spread
 from twofold.errors import TwofoldError
 from twofold.methods.base import Avatar, PosedAvatar
@@ -28,7 +29,6 @@ from twofold.outputs.export.bake_codecs import BakedColors, atlas_codec, paint_c
 from twofold.outputs.export.character import Character, normals_of
 from twofold.outputs.export.lattice import TriangleLattice, build_lattice, segments_for
 from twofold.outputs.export.morphs import PulledBack, pull_back
-from twofold.outputs.export.observed import observed_share
 
 QUERIES = 3_000_000
 """Points that the field is queried for the colours of one character, over all poses."""
@@ -197,7 +197,7 @@ def _painted(
     branch = "base" if color == "base" or config.branch == "base" else "full"
     lit = config.lit or not avatar.separates_light
     colors = bake_colors(avatar, shown, lattice.interpolate, branch, lit).cpu().numpy()
-    observed = _observed(capture, shape.frames, averaged, faces)
+    observed = _observed(capture, shape)
     if atlas is None:
         return BakedColors(colors[: len(vertices)], observed, None, None)
     progress(0.85, "texture")
@@ -209,13 +209,10 @@ def _painted(
     return BakedColors(colors[: len(vertices)], observed, as_bytes_image(texture), normals)
 
 
-def _observed(
-    capture: Capture, frames: Sequence[Pose], averaged: Shown, faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "V"]:
-    chosen = spread(frames, len(averaged))
-    posed = {frame.frame_index: back.posed for frame, (_, back) in zip(chosen, averaged, strict=True)}
-    views = [(f.camera, posed[f.frame_index].cpu().numpy()) for f in capture.train if f.frame_index in posed]
-    return observed_share(faces, views)
+def _observed(capture: Capture, shape: BakedShape) -> Float[np.ndarray, "V"]:
+    """How well training images observed the body below each vertex."""
+    body = shape.skin.rest.canonical_vertices.cpu()
+    return weights_at(coverage_of(capture).weight, body, shape.skin.canonical.cpu()).numpy()
 
 
 def normal_map(

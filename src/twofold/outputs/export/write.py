@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from twofold.body.motion import Motion
+from twofold.capture.coverage import coverage_of
 from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors, write_json
@@ -196,7 +197,6 @@ def standing(character: Character) -> Character:
 
 def record(baked: Baked, character: Character, written: Sequence[Path], seconds: float | None) -> dict[str, object]:
     """What an export holds and how good it is, for `export.json` and the report."""
-    observed = baked.character.observed
     return {
         "files": {path.name: path.stat().st_size for path in written},
         "triangles": len(character.faces),
@@ -207,11 +207,11 @@ def record(baked: Baked, character: Character, written: Sequence[Path], seconds:
         "texture": 0 if character.texture is None else len(character.texture),
         "lit": character.lit,
         "clips": {clip.name: len(clip.times) for clip in character.clips},
-        "observed_share": None if observed is None else float((observed > 0).mean()),
+        "coverage": coverage_of(baked.capture).share,
         "bake_seconds": None if seconds is None else round(seconds, 1),
         "about": {
             "morph_errors_mm": "RMS distance from the full surface of each frame pulled back through the skinning; "
             "targets fitted without every fifth frame, which are the left-out ones",
-            "observed_share": "share of the vertices that at least one of the sampled training images shows",
+            "coverage": "share of the body's surface that training images show well",
         },
     }

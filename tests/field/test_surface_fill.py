@@ -1,0 +1,99 @@
+"""Completed values over the surface of a body."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from tiny_person import person_body
+
+from twofold.body.skeleton import shape_body
+from twofold.field.surface_fill import HEAD, SurfaceFill, body_parts, cotangent_laplacian, weighted_median
+from twofold.geometry.surfaces import face_areas, vertex_normals
+
+BODY = person_body()
+# This body has no vertices that follow the head most; those above the neck do from here on.
+ABOVE = BODY.template[:, 1] > 0.24
+BODY = dataclasses.replace(BODY, weights=torch.where(ABOVE[:, None], torch.eye(24)[15], BODY.weights))
+SHAPED = shape_body(BODY, torch.zeros(1))
+REST, NORMALS = SHAPED.vertices.numpy(), vertex_normals(SHAPED.vertices, SHAPED.faces).numpy()
+COUNT = len(REST)
+MIDDLE = float(SHAPED.joints[0, 0])
+
+
+def areas():
+    area = torch.zeros(COUNT)
+    for corner in range(3):
+        area.index_add_(0, SHAPED.faces[:, corner], face_areas(SHAPED.vertices, SHAPED.faces) / 3)
+    return area.numpy()
+
+
+def fill(weight, values):
+    return SurfaceFill(SHAPED, weight.astype(np.float32), areas())(values.astype(np.float32))
+
+
+FRONT = (NORMALS[:, 2] > 0.1).astype(float)
+
+
+def test_mirrored_vertices_lie_on_the_other_side():
+    mirrored = REST[body_parts(SHAPED).mirrored]
+    off = mirrored - np.stack([2 * MIDDLE - REST[:, 0], REST[:, 1], REST[:, 2]], -1)
+    assert np.linalg.norm(off, axis=1).max() < 0.05
+
+
+def test_laplacian_annuls_constants_and_is_that_of_the_energy():
+    laplacian = cotangent_laplacian(REST.astype(np.float64), SHAPED.faces.numpy())
+    assert np.abs(laplacian @ np.ones(COUNT)).max() < 1e-9
+    # The Dirichlet energy of a coordinate is the integral of 1 - n_x^2 over the surface.
+    flat = SHAPED.vertices[SHAPED.faces].double()
+    normals = torch.linalg.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
+    size = normals.norm(dim=-1)
+    expected = float((0.5 * size * (1 - (normals[:, 0] / size) ** 2)).sum())
+    x = REST[:, 0].astype(np.float64)
+    assert abs(x @ (laplacian @ x) / expected - 1) < 0.25  # marching cubes make needles, whose weights are bounded
+
+
+def test_weighted_median_is_that_of_repeated_rows(generator):
+    values = torch.rand(9, 2, generator=generator).numpy()
+    counts = np.array([1, 2, 1, 3, 1, 1, 2, 1, 1])
+    assert np.allclose(weighted_median(values, counts.astype(float)), np.median(values.repeat(counts, 0), 0))
+
+
+def test_observed_values_stay():
+    values = REST @ np.array([[1.0], [0.3], [0.2]], np.float32)
+    found = fill(np.ones(COUNT), values)
+    assert np.abs(found - values).max() < 0.01
+
+
+def test_a_constant_stays_a_constant_whatever_was_observed():
+    assert np.abs(fill(FRONT, np.full((COUNT, 2), 0.37)) - 0.37).max() < 1e-3
+
+
+def test_a_side_that_was_not_seen_mirrors_the_one_that_was():
+    left = (REST[:, 0] > MIDDLE + 0.02).astype(float)
+    values = np.sin(6 * REST[:, 1:2] + 3 * np.abs(REST[:, :1] - MIDDLE) + 2 * REST[:, 2:])
+    found = fill(left, np.where(left[:, None] > 0, values, 5.0))
+    hidden = REST[:, 0] < MIDDLE - 0.06
+    hairless = hidden & (body_parts(SHAPED).group != HEAD)
+    assert np.abs(found - values)[hairless].mean() < 0.05
+
+
+def test_the_back_takes_the_colour_of_the_same_height_and_no_small_emblem():
+    shirt = (REST[:, 1:2] > -0.2).astype(float)
+    emblem = (np.linalg.norm(REST - [MIDDLE, 0.05, 0.11], axis=1) < 0.05)[:, None]
+    found = fill(FRONT, np.where(emblem, 3.0, shirt))
+    back = NORMALS[:, 2] < -0.5
+    trunk = body_parts(SHAPED).group != HEAD
+    far = np.abs(REST[:, 1] + 0.2) > 0.08
+    assert np.abs(found - shirt)[back & trunk & far].max() < 0.3
+
+
+def test_the_back_of_the_head_takes_the_hair_and_not_the_face():
+    head = body_parts(SHAPED).group == HEAD
+    height = (REST[:, 1] - REST[head, 1].min()) / np.ptp(REST[head, 1])
+    hair = (height > 0.85).astype(float)[:, None]
+    found = fill(FRONT, hair)
+    behind = head & (NORMALS[:, 2] < -0.6) & (height > 0.5)
+    assert behind.any()
+    assert found[behind].min() > 0.8
+    face = head & (NORMALS[:, 2] > 0.8) & (height < 0.7)
+    assert found[face].max() < 0.2

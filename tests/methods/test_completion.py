@@ -1,0 +1,151 @@
+"""Unobserved regions of an avatar take on what was observed elsewhere."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_recipes import CASES
+from tiny_person import person_colors, tiny_recipe
+
+from twofold.capture.coverage import coverage_of, weights_at
+from twofold.errors import TwofoldError
+from twofold.methods.base import Mode
+from twofold.methods.completion import Completion, CompletionConfig
+from twofold.methods.factorized_recipes import fast, paper, quick, released
+from twofold.methods.skinned_config import COMPLETING
+from twofold.methods.subject import Subject
+from twofold.methods.table import RECIPES, with_completion
+from twofold.training.loop import train
+from twofold.training.run import load, load_state, read_coverage, write_checkpoint
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def runs(person, tmp_path_factory):
+    """The tiny person trained with completion and without; the avatars by that."""
+    folder = tmp_path_factory.mktemp("completion")
+    return {
+        on: train(person, with_completion(tiny_recipe(150), on), folder / str(on), CPU)
+        if not on
+        else train(person, tiny_recipe(150), folder / str(on), CPU)
+        for on in (True, False)
+    }
+
+
+def on_surface(avatar, person):
+    """A posed avatar, the vertices moved to its base surface, and what the base branch says there."""
+    frame = person.train[0]
+    posed = avatar.pose(frame.pose, frame.translation)
+    vertices = avatar.canonical_points
+    with torch.no_grad():
+        answer = avatar.field.base_unlit(vertices, posed.own.condition)
+    return posed, vertices, answer
+
+
+def test_colours_nobody_saw_are_nearer_to_the_truth(runs, person):
+    unseen = coverage_of(person).weight < 0.05
+    truth = person_colors(person.body)
+    errors = {on: (on_surface(a, person)[2].color - truth)[unseen].abs().mean() for on, a in runs.items()}
+    assert unseen.float().mean() > 0.2
+    assert errors[True] < 0.95 * errors[False]
+
+
+def test_the_residual_is_off_where_nothing_was_observed(runs, person):
+    coverage = coverage_of(person)
+    for on, avatar in runs.items():
+        posed, vertices, _ = on_surface(avatar, person)
+        far = vertices[weights_at(coverage.weight, vertices, vertices, 30) == 0]
+        near = vertices[coverage.weight > 0.5]
+        assert len(far) >= 1
+        assert len(near) > 20
+        with torch.no_grad():
+            hidden, shown = (avatar.query(x, posed) for x in (far, near))
+        assert hidden.base is not None
+        assert torch.allclose(hidden.sdf, hidden.base.sdf) == on
+        assert (shown.sdf - shown.base.sdf).abs().max() > 1e-4
+
+
+def test_fine_features_stay_zero_where_nothing_was_observed(runs):
+    table, rows = runs[True].field.high_grid.table, runs[True].field._observed_rows()
+    assert 0.2 < rows.mean() < 0.9
+    assert not table[rows[:, 0] == 0].any()
+    assert table[rows[:, 0] == 1].any()
+
+
+def test_a_stored_avatar_is_the_same_again(runs, person, tmp_path):
+    from twofold.training.run import read_recipe, start_folder
+
+    avatar = runs[True]
+    recipe = replace(tiny_recipe(150), name="again")
+    start_folder(tmp_path / "run", recipe, avatar.subject, person.folder, coverage=coverage_of(person))
+    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))])
+    write_checkpoint(tmp_path / "run", avatar, optimizer, 150)
+    again, _ = load(tmp_path / "run")
+    assert read_recipe(tmp_path / "run").method.completion.active
+    x = avatar.canonical_points
+    posed, twin = (a.pose(person.train[0].pose, person.train[0].translation) for a in (avatar, again))
+    with torch.no_grad():
+        assert torch.equal(avatar.query(x, posed).color, again.query(x, twin).color)
+    assert torch.equal(read_coverage(tmp_path / "run", person).weight, coverage_of(person).weight)
+
+
+def test_a_checkpoint_of_a_run_without_completion_still_loads(runs, person, tmp_path):
+    avatar = runs[False]
+    assert not any("completion" in name or "observed" in name for name in avatar.state_dict())
+    fresh = with_completion(tiny_recipe(150), on=False).method.build(Subject.of(person))
+    load_state(fresh, {name: t.clone() for name, t in avatar.state_dict().items()}, tmp_path)
+
+
+def test_releases_and_the_paper_complete_nothing_and_the_quick_recipe_does():
+    assert [recipe().method.completion.active for recipe in (quick, released, paper)] == [True, False, False]
+    assert with_completion(fast(), on=True).method.completion == COMPLETING
+    assert with_completion(quick(), on=False).method.completion == CompletionConfig()
+
+
+@pytest.mark.parametrize("name", ["humannerf_fast", "npc_fast", "danbo_fast", "pm_avatar_fast", "monohuman_fast"])
+def test_methods_that_cannot_complete_say_so(name):
+    recipe = RECIPES[name]()
+    assert with_completion(recipe, on=False) == recipe
+    with pytest.raises(TwofoldError, match="does not complete unobserved regions"):
+        with_completion(recipe, on=True)
+
+
+@pytest.mark.parametrize("name", ["fast", "vid2avatar_mask_fast"])
+def test_dense_networks_are_pulled_to_the_targets_too(name, person, generator):
+    recipe = with_completion(CASES[name], on=True)
+    config = replace(recipe.method.completion, start=0, points=32)
+    avatar = replace(recipe.method, completion=config).build(Subject.of(person))
+    avatar.prepare_training(person, 0, generator)
+    avatar.before_step(Mode(step=0))
+    frame = person.train[0]
+    posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, Mode(step=0))
+    completion = avatar.completion
+    answers = []
+
+    def record(x, vertex):
+        answers.append((x, vertex))
+        return avatar.completed_beside(x, vertex, posed)
+
+    terms = completion.terms(record, 0, generator)
+    assert set(terms) == {"completion_color", "completion_shape"}
+    sum(terms.values()).backward()
+    assert any(p.grad is not None and p.grad.any() for p in avatar.field.parameters())
+    ((x, vertex),) = answers
+    assert (completion.weight[vertex] < 1).all()
+    along = ((x - completion.vertices[vertex]) * completion.normals[vertex]).sum(-1) - completion.offset[vertex]
+    assert -0.0201 < along.min() < along.max() < 0.0501
+
+
+def test_a_person_seen_from_all_sides_has_no_terms(generator):
+    shaped = tiny_shape()
+    completion = Completion(COMPLETING, shaped, shaped.vertices, shaped.vertices)
+    assert completion.terms(lambda x, v: pytest.fail("asked"), 1000, generator) == {}
+
+
+def tiny_shape():
+    from tiny_person import person_body
+
+    from twofold.body.skeleton import shape_body
+
+    return shape_body(person_body(), torch.zeros(1))
