@@ -139,7 +139,7 @@ def test_dense_networks_are_pulled_to_the_targets_too(name, person, generator):
 
 def test_a_person_seen_from_all_sides_has_no_terms(generator):
     shaped = tiny_shape()
-    completion = Completion(COMPLETING, shaped, shaped.vertices, shaped.vertices)
+    completion = Completion(COMPLETING, shaped, shaped.vertices)
     assert completion.terms(lambda x, v: pytest.fail("asked"), 1000, generator) == {}
 
 

@@ -13,6 +13,7 @@ from twofold.capture.coverage import Coverage
 from twofold.config import require_within
 from twofold.field.output import FieldOutput
 from twofold.field.surface_fill import SurfaceFill
+from twofold.geometry.surfaces import vertex_normals
 from twofold.losses import MAX_STEPS
 
 Answers = Callable[[Float[Tensor, "n 3"], Int[Tensor, "n"]], tuple[FieldOutput, ...]]
@@ -78,7 +79,6 @@ class Completion(nn.Module):
         config: CompletionConfig,
         shaped: ShapedBody,
         vertices: Float[Tensor, "V 3"],
-        normals: Float[Tensor, "V 3"],
     ) -> None:
         """Everything counts as observed until `prepare`.
 
@@ -86,7 +86,6 @@ class Completion(nn.Module):
             config: how.
             shaped: the body in the T-pose.
             vertices: of the canonical body, metres.
-            normals: of these.
         """
         super().__init__()
         self.config, self.shaped = config, shaped
@@ -96,7 +95,7 @@ class Completion(nn.Module):
         self.register_buffer("color", torch.zeros(count, 3))
         self.register_buffer("offset", torch.zeros(count))
         self.register_buffer("vertices", vertices.clone(), persistent=False)
-        self.register_buffer("normals", normals.clone(), persistent=False)
+        self.register_buffer("normals", vertex_normals(vertices, shaped.faces), persistent=False)
         self._fill: SurfaceFill | None = None
 
     def prepare(self, coverage: Coverage) -> None:

@@ -22,7 +22,7 @@ from twofold.deform.pose_refinement import PoseRefinement
 from twofold.deform.skinning import normal_matrices, to_canonical, vertex_transforms, weights_by
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
-from twofold.geometry.surfaces import nearest_vertices, vertex_normals
+from twofold.geometry.surfaces import nearest_vertices
 from twofold.methods.base import EVALUATION, Avatar, Batch, Mode, PosedAvatar, Rendering
 from twofold.methods.completion import Completion
 from twofold.methods.loss_terms import loss_terms
@@ -87,8 +87,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         self._sampler: Sampler = config.sampler.build(self.deformation, canonical.canonical_vertices, canonical.faces)
         self.completion: Completion | None = None
         if config.completion.active:
-            normals = vertex_normals(canonical.canonical_vertices, canonical.faces)
-            self.completion = Completion(config.completion, given, canonical.canonical_vertices, normals)
+            self.completion = Completion(config.completion, given, canonical.canonical_vertices)
 
     @property
     def _dense(self) -> bool:
@@ -156,13 +155,13 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
             self.late_shape.copy_(self.refinement.shape.detach())
         refresh, step = self.config.shell_refresh, mode.step or 0
         if self.refinement.parts and step and step % refresh == 0 and step >= self.config.pose.refine_from:
-            self._refresh_shells()
+            with torch.no_grad():
+                self._follow(*self._refined())
         if self.completion is not None and self.completion.is_due(step):
-            self._take_targets(self.completion, mode)
-
-    def _refresh_shells(self) -> None:
-        with torch.no_grad():
-            self._follow(*self._refined())
+            # In the first frame's pose, whatever this step shows: so any number of processes find the same.
+            subject = self.subject
+            posed = self.pose(subject.poses[0], subject.translations[0], int(subject.times[0]), mode)
+            self.completion.refresh(lambda x, vertex: self.answer_beside(x, vertex, posed))
 
     def _refined(self) -> tuple[Tensor, Tensor]:
         """Poses and translations of all training frames with their corrections."""
@@ -195,13 +194,6 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
                 self._observed = observed_corrections(self.subject, capture, pose.refine).to(self.device)
             self.refinement.project(self._observed)
         return "continue"
-
-    @torch.no_grad()
-    def _take_targets(self, completion: Completion, mode: Mode) -> None:
-        """In the first frame's pose, whatever this step shows: so any number of processes find the same."""
-        subject = self.subject
-        posed = self.pose(subject.poses[0], subject.translations[0], int(subject.times[0]), mode)
-        completion.refresh(lambda x, vertex: self.answer_beside(x, vertex, posed))
 
     def pose(
         self, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], frame_index: int | None = None,
