@@ -213,7 +213,7 @@ def test_the_page_stands_alone_and_no_name_breaks_it(turner, tmp_path):
     assert "<script>x</script>" in text
     assert "A & B" in text
     assert "8 of 31 images checked" in text
-    assert len(parsed.fetched) == 8
+    assert len(parsed.fetched) == 9, "eight overlays and the map of the coverage"
 
 
 def test_overlays_tint_left_limbs_orange_and_right_ones_blue(turner_read, turner_shaped, tmp_path):

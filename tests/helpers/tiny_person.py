@@ -15,7 +15,9 @@ from twofold.capture.types import Capture
 from twofold.field.factorized_grid import GridFieldConfig
 from twofold.geometry.cameras import Camera
 from twofold.geometry.raster import box_filter, rasterize, supersampled
+from twofold.methods.completion import CompletionConfig
 from twofold.methods.factorized_recipes import quick
+from twofold.methods.skinned_config import COMPLETING
 from twofold.recipe import Recipe
 from twofold.sampling.shell_sampler import ShellSampler
 from twofold.training.loop import Progress, train
@@ -129,11 +131,18 @@ def tiny_recipe(steps: int = 100, **training: object) -> Recipe:
         losses=replace(start.method.losses, eikonal_points=64),
         pose=replace(start.method.pose, zero_until=3, refine_from=4, refine=("root", "body", "translation", "shape")),
         shell_refresh=12,
-        completion=replace(start.method.completion, start=5, every=8, points=64),
+        completion=CompletionConfig(),
     )
     settings = {"steps": steps, "images_per_step": 1, "warmup": 3, "checkpoint_every": 10, "preview_every": 0}
     settings["pixels"] = replace(start.training.pixels, rays=256)
     return replace(start, name="tiny", method=method, training=replace(start.training, **(settings | training)))
+
+
+def completing_recipe(steps: int = 100, **training: object) -> Recipe:
+    """`tiny_recipe` with unobserved regions completed, from an early step on."""
+    recipe = tiny_recipe(steps, **training)
+    completion = replace(COMPLETING, start=5, every=8, points=64)
+    return replace(recipe, method=replace(recipe.method, completion=completion))
 
 
 @dataclass(frozen=True)

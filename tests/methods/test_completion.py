@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from small_recipes import CASES
-from tiny_person import person_colors, tiny_recipe
+from tiny_person import completing_recipe, person_colors, tiny_recipe
 
 from twofold.capture.coverage import coverage_of, weights_at
 from twofold.errors import TwofoldError
@@ -25,12 +25,8 @@ CPU = torch.device("cpu")
 def runs(person, tmp_path_factory):
     """The tiny person trained with completion and without; the avatars by that."""
     folder = tmp_path_factory.mktemp("completion")
-    return {
-        on: train(person, with_completion(tiny_recipe(150), on), folder / str(on), CPU)
-        if not on
-        else train(person, tiny_recipe(150), folder / str(on), CPU)
-        for on in (True, False)
-    }
+    recipes = {True: completing_recipe(150), False: tiny_recipe(150)}
+    return {on: train(person, recipe, folder / str(on), CPU) for on, recipe in recipes.items()}
 
 
 def on_surface(avatar, person):
@@ -77,7 +73,7 @@ def test_a_stored_avatar_is_the_same_again(runs, person, tmp_path):
     from twofold.training.run import read_recipe, start_folder
 
     avatar = runs[True]
-    recipe = replace(tiny_recipe(150), name="again")
+    recipe = replace(completing_recipe(150), name="again")
     start_folder(tmp_path / "run", recipe, avatar.subject, person.folder, coverage=coverage_of(person))
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))])
     write_checkpoint(tmp_path / "run", avatar, optimizer, 150)
@@ -93,7 +89,7 @@ def test_a_stored_avatar_is_the_same_again(runs, person, tmp_path):
 def test_a_checkpoint_of_a_run_without_completion_still_loads(runs, person, tmp_path):
     avatar = runs[False]
     assert not any("completion" in name or "observed" in name for name in avatar.state_dict())
-    fresh = with_completion(tiny_recipe(150), on=False).method.build(Subject.of(person))
+    fresh = tiny_recipe(150).method.build(Subject.of(person))
     load_state(fresh, {name: t.clone() for name, t in avatar.state_dict().items()}, tmp_path)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from small_recipes import CASES
-from tiny_person import Run, tiny_recipe
+from tiny_person import Run, completing_recipe, tiny_recipe
 
 from twofold.capture.coverage import coverage_of
 from twofold.capture.types import Capture
@@ -56,7 +56,7 @@ def assert_same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor],
 
 
 def recipe_of(steps: int, **training: object) -> Recipe:
-    return tiny_recipe(steps, checkpoint_every=3, images_per_step=2, **training)
+    return completing_recipe(steps, checkpoint_every=3, images_per_step=2, **training)
 
 
 def run_script(capture: Path, folder: Path, steps: int) -> subprocess.Popen[bytes]:

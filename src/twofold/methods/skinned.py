@@ -389,7 +389,7 @@ SHELL_MARGIN = 0.005
 """How far a body may move before its shell is built anew, metres: a quarter of a voxel. Until then samples are measured
 against the moved body; only at the shell's rim, centimetres from the body, some are missed."""
 SHELLS_KEPT = 512
-"""Shells of training frames that are kept, of two or three megabytes each; the one made first gives way."""
+"""Shells of training frames that are kept, of two or three megabytes each; the one made first is dropped."""
 _BETA_UNIT = 0.01
 """Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""
 
