@@ -40,3 +40,9 @@ def test_undistortion_is_the_inverse():
 def test_a_perfect_lens_moves_nothing():
     assert largest_distortion(K, np.zeros(5), 96, 104) < 1e-12
     assert largest_distortion(K, BENT, 96, 104) > 1
+
+
+def test_the_largest_distortion_is_in_a_corner():
+    barrel, corner = np.array([-0.1, 0, 0, 0, 0]), np.array([[0.0, 0.0]])
+    moved = np.linalg.norm(distorted_pixels(K, barrel, corner) - corner)
+    assert largest_distortion(K, barrel, 94, 104) == pytest.approx(moved, rel=1e-6)

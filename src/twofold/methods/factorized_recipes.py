@@ -198,6 +198,11 @@ ABLATIONS: dict[str, dict[str, object]] = {
 """The paper's ablations by what they change in the field; see `ablation`."""
 
 
+def has_grids(recipe: Recipe) -> bool:
+    """Whether the branches are feature grids, whose frequencies are voxel sizes, and not networks."""
+    return not isinstance(recipe.method.field, FactorizedFieldConfig)
+
+
 def ablation(name: str, start: Recipe) -> Recipe:
     """One of the paper's ablations of a recipe.
 

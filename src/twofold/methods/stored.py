@@ -15,7 +15,9 @@ ABSENT: dict[str, dict[str, object]] = {
     },
     "method.completion": {"color": 0.0, "shape": 0.0, "light": 0.0, "points": 512, "start": 200, "every": 200},
     "training": {"epochs": "images"},
-    "training.pixels": {"reachable": "body", "subject": "half", "between": False, "replacement": True},
+    "training.pixels": {
+        "reachable": "body", "subject": "half", "between": False, "replacement": True, "memory_gb": 1.0,
+    },
 }  # fmt: skip
 """By the place in a recipe, what was done before a setting existed. A new recipe stores all of its settings, so a
 default may change and a run still means the same."""

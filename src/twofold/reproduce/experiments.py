@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from twofold.errors import TwofoldError
-from twofold.field.factorized_grid import GridFieldConfig
-from twofold.methods.factorized_recipes import ABLATIONS, ablation, demo_recipe
+from twofold.methods.factorized_recipes import ABLATIONS, ablation, demo_recipe, has_grids
 from twofold.methods.table import RECIPES, with_settings
 from twofold.recipe import Recipe
 from twofold.reproduce.cells import Cell
@@ -136,7 +135,7 @@ GRID_CM = {5: 6, 6: 4, 8: 2, 10: 1}
 
 def frequency_rows(name: RecipeName, synthetic: bool) -> list[TableRow]:
     """The grid of frequencies; for feature grids `[x, y]` are the finest spacings of the two branches."""
-    grids = isinstance(base_recipe(name, synthetic).method.field, GridFieldConfig)
+    grids = has_grids(base_recipe(name, synthetic))
 
     def banded(key: str) -> Callable[[], Recipe]:
         return lambda: ablation(key, base_recipe(name, synthetic))

@@ -179,15 +179,6 @@ def test_unknown_pixels_stay_unknown():
     assert np.allclose(distort(view, undistort(view, pixels))[1], pixels[1], atol=0.01)
 
 
-def test_largest_distortion_is_in_a_corner():
-    view = camera(distortion=(-0.1, 0, 0, 0, 0))
-    corner = np.array([[0.0, 0.0]])
-    assert largest_distortion(view, 1280, 720) == pytest.approx(
-        np.linalg.norm(distort(view, corner) - corner), rel=1e-6
-    )
-    assert largest_distortion(camera(), 1280, 720) == 0
-
-
 def test_undistorted_images_are_what_a_perfect_lens_shows():
     view = replace(camera(distortion=LENS), height=256, width=144)
     view = replace(view, intrinsics=np.array([[200.0, 0, 71.5], [0, 200, 127.5], [0, 0, 1]]))
