@@ -89,7 +89,7 @@ def choreograph(
         seed: another seed, another order and other angles.
         rehearsed: frames of the training motion; the body turns twice about itself.
         unrehearsed: frames of the unseen motion, which follows.
-        yaw_range: the body turns to and fro within this angle about +z instead, in the training motion; degrees.
+        yaw_range: the body turns back and forth within this angle about +z instead, in the training motion; degrees.
 
     Returns:
         Axis-angle poses (radians, SMPL's T-pose is zero) and offsets (metres).
