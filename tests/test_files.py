@@ -325,7 +325,7 @@ def test_npz_never_writes_or_runs_python_objects(tmp_path):
         ("a.npz", None, "a.npz is missing"),
         ("a.npz", b"", "is damaged or no npz file"),
         ("a.npz", b"PK\x03\x04 cut short", "is damaged or no npz file"),
-        ("a.npz", b"\x80\x04pickle.", "is a pickle, .* never opened"),
+        ("a.npz", b"\x80\x04pickle.", "is a pickle, expected an npz file"),
         ("a.json", None, "a.json is missing"),
         ("a.json", b'{\n"a": nothing}', "not valid JSON at line 2"),
         ("a.json", b"\xff\xfe", "UTF-8"),

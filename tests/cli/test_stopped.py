@@ -59,7 +59,9 @@ def test_a_disk_that_fills_up_while_training_leaves_the_last_checkpoint(
         said = refused(capsys, "train", person_folder, "--out", run, *set_small(5))
     assert f"Cannot write {run / 'checkpoint.safetensors'}" in said
     assert read_checkpoint(run)[1] == 2
-    assert files(run) == {"checkpoint.safetensors", "curves.csv", "recipe.json", "run.json", "subject.npz"}
+    assert files(run) == {
+        "checkpoint.safetensors", "coverage.npz", "curves.csv", "recipe.json", "run.json", "subject.npz",
+    }  # fmt: skip
     on_preview(monkeypatch, lambda step: None)
     main(["train", "--resume", str(run)])
     assert read_checkpoint(run)[1] == 5

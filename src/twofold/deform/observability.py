@@ -46,6 +46,12 @@ def pose_jacobian(
     \[ \frac{\partial x}{\partial \theta_{k}} = -[x - x_k]_\times \, R_{\mathrm{parent}(k)} \, J(\theta_k) \]
 
     with the joint's position x_k, the rotation R of the joint above it, and `left_jacobian` J.
+
+    >>> joints = torch.arange(72.0).reshape(24, 3) / 72
+    >>> shaped = ShapedBody(joints, joints, torch.zeros(0, 3).long(), torch.eye(24), torch.zeros(24, 3, 0))
+    >>> points, moves = pose_jacobian(shaped, torch.zeros(24, 3), torch.zeros(3))
+    >>> points.shape, moves.shape, moves[0, :, 72:].diagonal().tolist()
+    (torch.Size([168, 3]), torch.Size([168, 3, 75]), [1.0, 1.0, 1.0])
     """
     transforms = joint_transforms(shaped.joints, pose, translation)
     positions = (transforms[:, :3, :3] @ shaped.joints[:, :, None])[..., 0] + transforms[:, :3, 3]
@@ -88,6 +94,12 @@ def observed_projection(
         points: of the body, world, metres.
         moves: their displacements by each of the pose's numbers.
         centers: of the training cameras that took this frame.
+
+    A point that moves along x, or along z away from the only camera:
+
+    >>> moves = torch.tensor([[[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]]])
+    >>> observed_projection(torch.tensor([[0.0, 0.0, 3.0]]), moves, torch.zeros(1, 3)).abs().round().tolist()
+    [[1.0, 0.0], [0.0, 0.0]]
     """
     moves, points, centers = moves.double(), points.double(), centers.double()
     every = moves.flatten(0, 1)

@@ -76,7 +76,9 @@ def build_lattices(
 
 
 def node_positions(lattices: Lattices) -> Float[Tensor, "N 3"]:
-    """Where the node of each table row lies, metres; the row of everywhere else lies in a corner of its level.
+    r"""Where the node of each table row lies, metres; the row of everywhere else lies in a corner of its level.
+
+    \[ x_{ijk} = l + h \, (i, j, k) \qquad \text{with the level's corner } l \text{ and spacing } h \]
 
     >>> lattices, positions = build_lattices(np.zeros((1, 3), np.float32), (0.1, 0.05), radius=0.02)
     >>> torch.allclose(node_positions(lattices)[1:5], torch.from_numpy(positions)[1:5])

@@ -47,7 +47,18 @@ class BodyParts:
 
 
 def body_parts(shaped: ShapedBody) -> BodyParts:
-    """The parts of a body in SMPL's T-pose."""
+    r"""The parts of a body in SMPL's T-pose, and which vertex is the mirror image of which.
+
+    \[ m(i) = \arg\min_j \lVert v_j - (2 c_x - x_i, y_i, z_i) \rVert, \qquad c \text{ the pelvis} \]
+
+    >>> import torch
+    >>> vertices = torch.tensor([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    >>> weights = torch.nn.functional.one_hot(torch.tensor([1, 2, 15]), 24).float()
+    >>> shaped = ShapedBody(vertices, torch.zeros(24, 3), torch.tensor([[0, 1, 2]]), weights, torch.zeros(3, 3, 0))
+    >>> parts = body_parts(shaped)
+    >>> parts.mirrored.tolist(), [(LEGS, LEGS, HEAD)[k] == parts.group[k] for k in range(3)]
+    ([1, 0, 2], [True, True, True])
+    """
     rest = shaped.vertices.numpy()
     group = np.array(GROUPS)[shaped.weights.numpy().argmax(1)]
     level = np.isin(group, (ARMS, HANDS))
@@ -62,6 +73,10 @@ def cotangent_laplacian(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarra
     r"""The positive semidefinite Laplacian of a triangle mesh; negative weights of obtuse triangles become tiny ones.
 
     \[ L_{ij} = -\tfrac12 (\cot \alpha_{ij} + \cot \beta_{ij}), \qquad L_{ii} = -\sum_{j \ne i} L_{ij} \]
+
+    >>> corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    >>> cotangent_laplacian(corners, np.array([[0, 1, 2]])).toarray().round(2).tolist()
+    [[1.0, -0.5, -0.5], [-0.5, 0.5, -0.0], [-0.5, -0.0, 0.5]]
     """
     rows, columns, values = [], [], []
     for corner in range(3):
@@ -79,7 +94,9 @@ def cotangent_laplacian(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarra
 
 
 def weighted_median(values: Float[np.ndarray, "n C"], weight: Float[np.ndarray, "n"]) -> Float[np.ndarray, "C"]:
-    """The median of each column, each row counted by its weight.
+    r"""The median of each column, each row counted by its weight.
+
+    \[ \min \{ v_k : \sum_{v_i \le v_k} w_i \ge \tfrac12 \sum_i w_i \} \]
 
     >>> weighted_median(np.array([[1.0], [2.0], [9.0]]), np.array([1.0, 1.0, 3.0]))
     array([9.])
@@ -161,13 +178,19 @@ class SurfaceFill:
         """1 where hair grows on nearly everybody: the crown, and the head behind the ears down to the nape."""
         height, behind = self._head_heights()
         back = np.clip((behind + 0.01) / 0.02, 0, 1) * np.clip((height - NAPE) / 0.1, 0, 1)
-        crown = np.clip((height - SCALP) / 0.05, 0, 1)
-        return np.where(self.parts.group == HEAD, np.maximum(back, crown), 0.0)
+        return np.where(self.parts.group == HEAD, np.maximum(back, self._crown()), 0.0)
+
+    def _crown(self) -> Float[np.ndarray, "V"]:
+        """1 on the top of the head, 0 below."""
+        return np.where(self.parts.group == HEAD, np.clip((self._head_heights()[0] - SCALP) / 0.05, 0, 1), 0.0)
 
     def _hair(self, values: Float[np.ndarray, "V C"], trust: Float[np.ndarray, "V"]) -> Float[np.ndarray, "C"]:
-        """What was observed of the hair, or else of the highest part of the head that was."""
+        """What was observed of the crown, or else of the highest part of the head that was.
+
+        Not of all that is hairy: a camera in front sees ears and cheeks beside it.
+        """
         height, _ = self._head_heights()
-        counted = trust * self.hairy
+        counted = trust * self._crown()
         if counted.sum() < 1e-4:  # less than a square centimetre
             seen = (self.parts.group == HEAD) & (self.weight > 0)
             if not seen.any():
