@@ -145,3 +145,15 @@ def tiny_shape():
     from twofold.body.skeleton import shape_body
 
     return shape_body(person_body(), torch.zeros(1))
+
+
+def test_a_subject_that_is_nearly_all_observed_is_left_alone(person):
+    shaped = Subject.of(person)
+    avatar = completing_recipe(1).method.build(shaped)
+    coverage, completion = coverage_of(person), avatar.completion
+    for share, left_alone in ((0.95, True), (0.8, False)):
+        order = coverage.area.cumsum(0) / coverage.area.sum()
+        completion.prepare(replace(coverage, weight=(order <= share).float()))
+        assert (completion.unobserved == 0) == left_alone
+        assert bool((completion.weight == 1).all()) == left_alone
+        assert completion.is_due(completion.config.start) != left_alone
