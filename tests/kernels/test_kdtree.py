@@ -77,6 +77,8 @@ def test_a_search_that_is_interrupted_ends_before_its_process_does():
     """SciPy's own threads run on after Ctrl-C and read the tree that the ending process has freed."""
     script = (
         "import numpy as np, signal, sys, threading, torch; from twofold.kernels.kdtree import *;"
+        # A process that was started in the background ignores Ctrl-C.
+        "signal.signal(signal.SIGINT, signal.default_int_handler);"
         "torch.set_num_threads(4); random = np.random.default_rng(0);"
         "tree = search_tree(random.normal(size=(50_000, 3))); sought = random.normal(size=(400_000, 3));"
         "threading.Timer(0.1, lambda: signal.raise_signal(signal.SIGINT)).start()\n"
