@@ -26,8 +26,6 @@ RESULT = "comparison.json"
 SPLITS = {"novel_view": "Novel views", "novel_pose": "Novel poses"}
 ROWS = 3
 """Frames of a split that are shown, of different cameras where there are several."""
-GENERAL = {"frames", "poses", "background", "surface", "moments"}
-"""Parts of a protocol that belong to no single metric."""
 MISSING = "\N{EN DASH}"
 
 

@@ -26,7 +26,7 @@ from twofold.check.frame_measures import (
 )
 from twofold.geometry.cameras import project
 from twofold.geometry.raster import rasterize
-from twofold.prepare.silhouettes import overlap
+from twofold.geometry.silhouettes import overlap
 
 OTHER = [JOINT_NAMES.index(n.replace("left", "x").replace("right", "left").replace("x", "right")) for n in JOINT_NAMES]
 

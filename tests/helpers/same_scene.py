@@ -3,8 +3,8 @@
 import numpy as np
 
 from twofold.body.skeleton import pose_body, shape_body
-from twofold.capture.readers.image_converter import silhouette
 from twofold.geometry.cameras import project
+from twofold.geometry.silhouettes import overlap, silhouette
 
 
 def require_same_scene(capture, scene, cameras, frame_of=lambda frame: frame, soft=0.85, colours=25):
@@ -30,7 +30,7 @@ def require_same_scene(capture, scene, cameras, frame_of=lambda frame: frame, so
             off = np.abs(project(frame.camera, posed.vertices)[0].numpy() - expected).max()
             assert off < 0.05, (frame.camera_name, frame.frame_index, off)  # half a pixel is promised
             image, mask = scene.image(c, t)
-            shown = silhouette(frame.camera, capture.body, capture.betas, frame.pose, frame.translation)
+            shown = silhouette(frame.camera, posed.vertices, posed.faces)
             if factor == 1:
                 assert overlap(shown, mask > 0) > 0.99
             assert overlap(shown, frame.mask().numpy() > 0.5) > soft
@@ -40,7 +40,3 @@ def require_same_scene(capture, scene, cameras, frame_of=lambda frame: frame, so
             count += 1
     assert count
     return count
-
-
-def overlap(one, other):
-    return np.count_nonzero(one & other) / np.count_nonzero(one | other)

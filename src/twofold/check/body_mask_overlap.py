@@ -7,7 +7,7 @@ import numpy as np
 from twofold.check.findings import Finding, counted, graded, places, places_of
 from twofold.check.frame_measures import FrameFacts
 from twofold.check.measure import POOR, Doubt, Facts, inverted
-from twofold.prepare.silhouettes import MAX_BAD, MIN_IOU
+from twofold.prepare.output.acceptance import MAX_BAD, MIN_IOU
 
 BETTER, TELLING = 0.03, 0.1
 """A twin fits better when its IoU is higher by so much; it tells something where it covers so much else."""

@@ -25,7 +25,7 @@ from twofold.errors import TwofoldError
 from twofold.files import json_text, write_together
 from twofold.html.charts import SERIES, Bar, Curve, bars_svg, directions_svg, dots_svg
 from twofold.html.page import KeyMetric, Table, embedded_image, render
-from twofold.prepare.silhouettes import MIN_IOU
+from twofold.prepare.output.acceptance import MIN_IOU
 from twofold.prepare.turning import SEEN, sides_seen
 
 REPORT, NUMBERS = "index.html", "check.json"

@@ -17,7 +17,7 @@ from twofold.body.skeleton import ShapedBody
 from twofold.capture.types import Frame
 from twofold.check.convention_candidates import CONVENTIONS, Convention, Placed, sizes
 from twofold.check.frame_measures import TWIN_SIZE, posed_points, read_mask, splat, window_of
-from twofold.prepare.silhouettes import overlap
+from twofold.geometry.silhouettes import overlap
 
 AROUND = 0.5
 """The window reaches beyond the mask by so much of its longer side; a body drawn farther off counts as missing it."""

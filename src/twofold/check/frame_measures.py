@@ -15,8 +15,8 @@ from twofold.check.mask_measures import MaskFacts, mask_facts
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.raster import Hits, rasterize
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from twofold.geometry.silhouettes import overlap
 from twofold.images import read_grey, read_rgb
-from twofold.prepare.silhouettes import overlap
 
 LOOKED_AT = 320
 """Longest side, in pixels, at which body and mask are compared: finer than any fit is, and quick."""

@@ -12,7 +12,7 @@ from twofold.check.frame_measures import FrameFacts
 from twofold.check.measure import CameraFacts, Facts, inverted
 from twofold.check.motion_measures import LIMBS, STILL
 from twofold.prepare.detect.background import MOVING
-from twofold.prepare.silhouettes import MAX_BAD
+from twofold.prepare.output.acceptance import MAX_BAD
 from twofold.prepare.turning import SEEN
 
 STATURES, POSSIBLE_STATURES = (1.2, 2.2), (0.5, 3.0)

@@ -196,11 +196,6 @@ class SceneState:
             limbs = torch.zeros(3)
             self._set(replace(self._shown, pose=pose.with_joint(1, limbs).with_joint(2, limbs)))
 
-    def field_changed(self) -> None:
-        """Notes that the field looks different now, as it does while it is trained."""
-        with self._lock:
-            self._set(self._shown)
-
     def _set(self, shown: Shown) -> None:
         self._shown = shown
         self._version += 1

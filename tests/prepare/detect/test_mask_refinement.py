@@ -5,8 +5,8 @@ import pytest
 from PIL import Image, ImageDraw
 from scipy import ndimage
 
+from twofold.geometry.silhouettes import overlap
 from twofold.prepare.detect.mask_refinement import background_plate, refine_clip, refined_mask
-from twofold.prepare.silhouettes import overlap
 
 SCALE, COUNT = 3, 10
 HEIGHT, WIDTH = 120 * SCALE, 160 * SCALE

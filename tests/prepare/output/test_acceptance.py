@@ -18,6 +18,7 @@ from twofold.prepare.detections import LANDMARKS, Track
 from twofold.prepare.output.acceptance import (
     MAX_REPROJECTION,
     MIN_IMAGES,
+    MIN_IOU,
     MIN_VISIBILITY,
     ImageQuality,
     image_quality,
@@ -27,7 +28,6 @@ from twofold.prepare.output.acceptance import (
     require_whole,
     warnings_about,
 )
-from twofold.prepare.silhouettes import MIN_IOU
 from twofold.prepare.turning import arc, camera_directions
 
 CAMERA = standing_camera()

@@ -14,7 +14,7 @@ from twofold.capture.readers.world import posed
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.lens import image_undistorter, largest_distortion
-from twofold.geometry.raster import rasterize
+from twofold.geometry.silhouettes import overlap, silhouette
 
 _LENS_MATTERS = 0.05
 """Pixels: a lens that moves no point by more needs no resampling."""
@@ -107,21 +107,5 @@ def agreement(
     translation: Float[Tensor, "3"],
 ) -> float:
     """Silhouette IoU of a mask and the posed body, 0..1."""
-    shown = silhouette(camera, body, betas, pose, translation)
-    person = mask >= _PERSON
-    union = np.count_nonzero(shown | person)
-    return np.count_nonzero(shown & person) / union if union else 0.0
-
-
-def silhouette(
-    camera: Camera,
-    body: Body,
-    betas: Float[Tensor, "S"],
-    pose: Float[Tensor, "24 3"],
-    translation: Float[Tensor, "3"],
-) -> np.ndarray:
-    """Pixels that see the posed body."""
     surface = posed(body, betas, pose, translation)
-    seen = torch.zeros(camera.height * camera.width, dtype=torch.bool)
-    seen[rasterize(camera, surface.vertices, surface.faces).pixel] = True
-    return seen.reshape(camera.height, camera.width).numpy()
+    return overlap(silhouette(camera, surface.vertices, surface.faces), mask >= _PERSON)

@@ -105,10 +105,6 @@ class Sequence3D:
     remarks: Sequence[str] = ()
     notes: Mapping[str, object] = field(default_factory=dict)
 
-    def frames_of(self, camera: str) -> list[int]:
-        """Frames that a camera has images of."""
-        return sorted(frame for name, frame in self.images if name == camera)
-
 
 def image_from_files(image: Path, masks: Sequence[Path], labels: bool) -> SourceImage:
     """An image in a file, with the union of the masks in some files.

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image
 from scipy import ndimage
 
+from twofold.capture.types import spread
+from twofold.images import read_grey, read_rgb
 from twofold.kernels.parallel import in_parts
 
 PLATE_IMAGES = 40
@@ -190,8 +191,8 @@ def refine_clip(
     Returns:
         the share of the masks' pixels that changed sides.
     """
-    some = np.unique(np.linspace(0, len(images) - 1, min(len(images), PLATE_IMAGES)).round().astype(int)).tolist()
-    pixels, found = [_read(images[i], "RGB") for i in some], [_read(masks[i], "L") for i in some]
+    some = spread(range(len(images)), PLATE_IMAGES)
+    pixels, found = [read_rgb(images[i]) for i in some], [read_grey(masks[i]) for i in some]
     first = background_plate(pixels, found)
     begun = in_parts(len(some), lambda a, b: [refined_mask(pixels[i], found[i], first) for i in range(a, b)], 4)
     plate = background_plate(pixels, [mask for part in begun for mask in part])
@@ -204,8 +205,8 @@ def refine_clip(
         def one(a: int, b: int, batch: range = batch) -> list[tuple[int, int]]:
             counts: list[tuple[int, int]] = []
             for i in batch[a:b]:
-                mask = _read(masks[i], "L")
-                better = refined_mask(_read(images[i], "RGB"), mask, plate)
+                mask = read_grey(masks[i])
+                better = refined_mask(read_rgb(images[i]), mask, plate)
                 save(masks[i], better)
                 counts.append((int(((mask > 127) != (better > 127)).sum()), int((mask > 127).sum())))
             return counts
@@ -215,8 +216,3 @@ def refine_clip(
                 changed, total = changed + moved, total + area
         progress(0.2 + 0.8 * (batch[-1] + 1) / len(images))
     return changed / max(total, 1)
-
-
-def _read(path: Path, mode: str) -> UInt8[np.ndarray, "h w *c"]:
-    with Image.open(path, formats=("PNG", "JPEG")) as image:
-        return np.array(image.convert(mode))

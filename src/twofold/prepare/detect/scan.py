@@ -15,10 +15,10 @@ from scipy import ndimage
 
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors
+from twofold.geometry.silhouettes import overlap
 from twofold.prepare.detect.background import Surroundings, background_motion, surroundings_of
 from twofold.prepare.detect.person import Region, around_mask, only
 from twofold.prepare.detections import Estimator, Observation, Track, track_of
-from twofold.prepare.silhouettes import overlap
 from twofold.prepare.video.frames import VideoFrame
 
 _SAMPLES, _VIEWS = 12, 40

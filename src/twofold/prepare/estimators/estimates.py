@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -231,6 +232,12 @@ def as_axis_angle(value: object, joints: int, what: str, where: object) -> Float
     flat = numbers(value, (None, 3 * joints), what, where)
     require_radians(flat.reshape(-1, 3), f"{what} of {where}")
     return torch.from_numpy(flat).reshape(count, joints, 3)
+
+
+def entries_have(content: Any, *keys: str) -> bool:
+    """Whether the content of a file is a dictionary of dictionaries, the first of which has these keys."""
+    first = next(iter(content.values()), None) if isinstance(content, dict) else None
+    return isinstance(first, dict) and set(keys) <= first.keys()
 
 
 def betas_of(value: object, count: int, where: object) -> Float[Tensor, "n S"]:

@@ -18,6 +18,7 @@ from twofold.prepare.estimators.estimates import (
     PoseOptions,
     as_axis_angle,
     betas_of,
+    entries_have,
     tracks_of,
     wide_lens,
 )
@@ -28,10 +29,7 @@ KEYS = ("tid", "smpl", "camera", "tracked_time")
 
 def matches(content: Any) -> bool:
     """Whether the content of a pickle looks like them."""
-    if not isinstance(content, dict) or not content:
-        return False
-    first = next(iter(content.values()))
-    return isinstance(first, dict) and "smpl" in first and "camera" in first
+    return entries_have(content, "smpl", "camera")
 
 
 def read(path: Path, options: PoseOptions) -> Estimates:

@@ -18,6 +18,7 @@ from twofold.prepare.estimators.estimates import (
     PoseOptions,
     as_axis_angle,
     betas_of,
+    entries_have,
     wide_lens,
 )
 
@@ -26,10 +27,7 @@ _WORDS = "results of WHAM"
 
 def matches(content: Any) -> bool:
     """Whether the content of a pickle looks like them."""
-    if not isinstance(content, dict) or not content:
-        return False
-    first = next(iter(content.values()))
-    return isinstance(first, dict) and "frame_ids" in first and "pose" in first
+    return entries_have(content, "frame_ids", "pose")
 
 
 def read(path: Path, options: PoseOptions) -> Estimates:

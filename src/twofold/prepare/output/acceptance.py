@@ -12,9 +12,13 @@ from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
 from twofold.prepare.detect.background import MOVING
 from twofold.prepare.detections import LANDMARKS, Track
-from twofold.prepare.silhouettes import MAX_BAD, MIN_IOU
 from twofold.prepare.turning import FULL_TURN
 
+MIN_IOU = 0.7
+"""A frame whose silhouette overlaps its mask by less is fitted badly: limbs are somewhere else. Measured on real
+clips, failed fits lie well below."""
+MAX_BAD = 0.3
+"""With a larger share of bad frames the rest cannot outvote them."""
 MAX_REPROJECTION, MIN_VISIBILITY = 4.0, 0.5
 """An image above, below these is left out: measured on real clips, failed fits lie well beyond."""
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from twofold.body.skeleton import Body
 from twofold.files import plain_errors
 from twofold.geometry.cameras import Camera, project
+from twofold.geometry.silhouettes import overlap, silhouette
 from twofold.images import read_rgb
 from twofold.prepare.detect.scan import Watched, save_picture, spread_out
 from twofold.prepare.fitting.body_landmarks import body_points
@@ -23,7 +24,6 @@ from twofold.prepare.fitting.parameters import FittedMotion, Posed, choose, plac
 from twofold.prepare.output.acceptance import ImageQuality, image_quality
 from twofold.prepare.output.held_objects import SeenBody, see_body, usual_colors
 from twofold.prepare.output.object_tracks import Patch, Sighting, foreign_patches, moving_objects, without
-from twofold.prepare.silhouettes import overlap, silhouette
 
 _COLOR_SAMPLE = 120
 """Images from which a vertex's usual colour is learned."""

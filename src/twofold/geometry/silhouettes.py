@@ -1,4 +1,4 @@
-"""What a posed body covers in an image, and how well that agrees with a mask: the one measure of a fit's silhouette."""
+"""What a posed body covers in an image, and how well that agrees with a mask: the one measure of silhouettes."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -6,12 +6,6 @@ from torch import Tensor
 
 from twofold.geometry.cameras import Camera
 from twofold.geometry.raster import rasterize
-
-MIN_IOU = 0.7
-"""A frame whose silhouette overlaps its mask by less is fitted badly: limbs are somewhere else. Measured on real
-clips, failed fits lie well below."""
-MAX_BAD = 0.3
-"""With a larger share of bad frames the rest cannot outvote them."""
 
 
 def silhouette(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Bool[np.ndarray, "h w"]:
