@@ -228,3 +228,15 @@ def test_every_number_stands_beside_its_protocol() -> None:
 
 def test_numbers_have_the_digits_that_help() -> None:
     assert [number(v) for v in (0.0, -0.5, 1234.5, 99.999, 1e-5)] == ["0.0000", "-0.5000", "1,234", "100.00", "1.0e-05"]
+
+
+def test_a_path_of_a_video_is_taken_as_it_is_and_a_name_from_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page that is written to `demo`, seen from where the command runs, has its videos in `demo` and not below."""
+    monkeypatch.chdir(tmp_path)
+    place = Path("demo")
+    place.mkdir()
+    (place / "turn.mp4").write_bytes(b"film")
+    pages = [write_report(place, "x", [Section("y", "", (Video(file),))]) for file in (place / "turn.mp4", "turn.mp4")]
+    assert all("data:video/mp4;base64,Zmlsb" in page.read_text() for page in pages)

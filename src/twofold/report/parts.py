@@ -51,7 +51,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Video:
-    """A video (MP4), put into the page: a path, or one from the page's folder."""
+    """A video (MP4), put into the page: a `Path` as it is, or a name (`str`) in the page's folder."""
 
     file: str | Path
     caption: str = ""
@@ -206,7 +206,8 @@ def _shown(part: Part | CaptionedImage, folder: Path) -> object:
     if isinstance(part, CaptionedImage):
         return _embedded(part)
     if isinstance(part, Video):
-        return embedded_video(folder / part.file, part.caption, part.size)
+        path = folder / part.file if isinstance(part.file, str) else part.file
+        return embedded_video(path, part.caption, part.size)
     if isinstance(part, Row):
         return {"label": part.label, "wrapped": part.wrapped, "images": [_embedded(image) for image in part.images]}
     if isinstance(part, Chart):
