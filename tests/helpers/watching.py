@@ -17,13 +17,16 @@ class Eye:
     """A watcher that keeps what it is sent."""
 
     def __init__(self, camera):
-        self.seen, self.sent, self.free = camera, [], True
+        self.seen, self.sent, self.free, self.lagging = camera, [], True, False
 
     def camera(self):
         return self.seen
 
     def ready(self):
         return self.free
+
+    def slow(self):
+        return self.lagging
 
     def send(self, image, note):
         self.sent.append((image, note))

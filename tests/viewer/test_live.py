@@ -4,7 +4,7 @@ from watching import Eye, camera_at
 
 from twofold.errors import TwofoldError
 from twofold.outputs.views import RenderedImage
-from twofold.viewer.live import SETTLED, ViewLoop
+from twofold.viewer.live import SETTLED, SLOW_ROWS, ViewLoop
 from twofold.viewer.meshes import Meshes
 
 
@@ -161,3 +161,12 @@ def test_a_fault_is_said_and_ends_one_rendering_only(viewed, state, clock, eye):
     state.scrub(1)
     assert loop._safe_step()
     assert eye.notes == ["Bare body", "Bare body"]
+
+
+def test_slow_browser_gets_fewer_pixels_while_the_mesh_moves(loop, eye, viewed):
+    eye.seen = camera_at(viewed, 600, 800)
+    loop.step()
+    eye.lagging = True
+    loop.camera_moved(1)
+    loop.step()
+    assert [image.color.shape[0] for image, _ in eye.sent] == [600, SLOW_ROWS]

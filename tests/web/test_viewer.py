@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import require_browser
+from browser import require_browser, require_web, validate_gltf
 from chromium import Chromium
 from PIL import Image
 
 from twofold.capture.folder import read_capture
+from twofold.viewer.meshes import Meshes
+from twofold.viewer.saving import save_glb
+from twofold.viewer.scene_state import SceneState
 from twofold.viewer.server import LOOPBACK
 from twofold.viewer.session import ViewSession
 from twofold.viewer.view_images import PAPER
@@ -68,6 +71,21 @@ def test_chromium_shows_a_moving_person_and_asks_no_other_host(person_folder: Pa
         hosts = {address for address in page.addresses() if not address.startswith(("data:", "blob:"))}
         own = session.address.removeprefix("http://")
         assert all(address.partition("://")[2].startswith(own) for address in hosts), hosts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("edited", [False, True])
+def test_validator_accepts_the_character_that_the_viewer_saves(
+    edited: bool, person_folder: Path, tmp_path: Path
+) -> None:
+    require_web("node")
+    viewed = view_capture(read_capture(person_folder))
+    state = SceneState(viewed.body, viewed.turn, viewed.timelines)
+    if edited:
+        state.choose_timeline(named_motion(viewed, "walk"))
+        state.set_joint(18, state.pose.pose[18] + 0.5)
+    (issues,) = validate_gltf(save_glb(tmp_path / "saved", viewed, state, Meshes(viewed)))
+    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
 
 
 def until_seen(page: Chromium, file: Path) -> np.ndarray:

@@ -20,11 +20,39 @@ _QUALITY = 88
 _PATIENCE = 2.0
 """Seconds after which the next image is sent all the same."""
 ANSWERS = 2
+SLOW, QUICK = 0.050, 0.033
+"""Seconds from sending an image to the last answer, on average, above which a browser is slow, and below which it no
+longer is. A graphics card needs two frames of its screen; software rendering spends its time on pixels."""
+_MEMORY = 0.8
+"""Weight of the earlier images in that average."""
 _FOV = math.radians(40)
 _AWAY = 2.1
 """Distance of the first view, in heights of the body."""
 _NOTES_EVERY = 0.3
 """Seconds between two notes while images follow each other."""
+
+
+@final
+class Pace:
+    """How long a browser takes to show an image.
+
+    >>> pace = Pace()
+    >>> for _ in range(20):
+    ...     pace.note(0.08)
+    >>> pace.slow
+    True
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self.slow = False
+
+    def note(self, seconds: float) -> None:
+        """Takes one more image into the average."""
+        self.seconds = _MEMORY * self.seconds + (1 - _MEMORY) * seconds
+        # Between the two limits nothing changes: smaller images are shown sooner, which is no reason to go back.
+        if self.seconds > SLOW or self.seconds < QUICK:
+            self.slow = self.seconds > SLOW
 
 
 @final
@@ -50,12 +78,17 @@ class Browser:
         self._next: tuple[ViewImage, str] | None = None
         self._changed = threading.Condition()
         self._left = False
+        self._pace = Pace()
         self.sent = 0
         threading.Thread(target=self._work, name="browser", daemon=True).start()
 
     def ready(self) -> bool:
         """Whether it can take another image: one is on its way, the next one may be rendered meanwhile."""
         return self._next is None
+
+    def slow(self) -> bool:
+        """Whether it takes long to show an image."""
+        return self._pace.slow
 
     def camera(self) -> Camera | None:
         """From where the browser looks; None before it has a size."""
@@ -93,7 +126,7 @@ class Browser:
             self._show(image, note)
 
     def _show(self, image: ViewImage, note: str) -> None:
-        depth = image.depth if self._wants_depth() else None
+        depth, began = image.depth if self._wants_depth() else None, time.monotonic()
         self._client.scene.set_background_image(image.color, "jpeg", jpeg_quality=_QUALITY, depth=depth)
         self.sent += 1
         now = time.monotonic()
@@ -103,6 +136,7 @@ class Browser:
         with contextlib.suppress(RuntimeError, TimeoutError):  # it has left, or it sleeps in a tab that nobody sees
             for _ in range(ANSWERS):
                 self._client.local_storage.get_item("twofold", timeout=_PATIENCE)
+            self._pace.note(time.monotonic() - began)
 
 
 def first_view(viewed: Viewed) -> KeyView:

@@ -18,8 +18,8 @@ SETTLED = 0.25
 """Seconds without a change after which the field is rendered."""
 FASTEST = 1 / 30
 """Seconds between two images of the mesh, at least."""
-MOVING_ROWS = 720
-"""Rows of an image of the mesh while something moves, at most."""
+MOVING_ROWS, SLOW_ROWS = 720, 440
+"""Rows of an image of the mesh while something moves, at most; and for a browser that is slow to show images."""
 FIRST_ROWS, ALL_ROWS = 256, 4096
 """Rows of the field's first image, and of its last one at most."""
 
@@ -34,6 +34,10 @@ class Watcher(Protocol):
 
     def ready(self) -> bool:
         """Whether it can show another image."""
+        ...
+
+    def slow(self) -> bool:
+        """Whether it takes long to show one, as without a graphics card."""
         ...
 
     def send(self, image: ViewImage, note: str) -> None:
@@ -156,7 +160,7 @@ class ViewLoop:
         if camera is None or seat.drawn == key or not seat.watcher.ready():
             return False
         seat.drawn, seat.changed_at, seat.stage = key, now, 0
-        size = fitted_size(camera.height, camera.width, MOVING_ROWS)
+        size = fitted_size(camera.height, camera.width, SLOW_ROWS if seat.watcher.slow() else MOVING_ROWS)
         self._show_mesh(seat, shown, camera.resized(*size), samples=1)
         return True
 
