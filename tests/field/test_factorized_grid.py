@@ -8,8 +8,8 @@ import pytest
 import torch
 from little_body import ball
 
-from twofold.body.skeleton import PosedBody, canonical_pose
-from twofold.field.factorized_grid import GridFieldConfig
+from twofold.body.skeleton import JOINT_NAMES, PosedBody, canonical_pose
+from twofold.field.factorized_grid import GridFieldConfig, points_of
 from twofold.field.grids import Lattices, interpolate
 
 SMALL = GridFieldConfig(
@@ -25,8 +25,10 @@ ABLATIONS = {
     "Pose_lf, one branch": replace(SMALL, pose_into="low", branches="low"),
     "Pose_lf, without low branch": replace(SMALL, pose_into="low", branches="high"),
     "w/o comm": replace(SMALL, branches="high_rendered"),
+    "bands by part": replace(SMALL, detail_voxels=(0.05,), detail_parts=("head",)),
 }
 POSE_SIZE = 6
+HEAD = JOINT_NAMES.index("head")
 
 
 def ball_body():
@@ -36,7 +38,7 @@ def ball_body():
         vertices=vertices,
         canonical_vertices=vertices,
         faces=torch.from_numpy(faces),
-        weights=torch.full((len(points), 24), 1 / 24),
+        weights=torch.nn.functional.one_hot(torch.where(vertices[:, 1] > -0.02, HEAD, 0), 24).to(vertices),
         bones=torch.eye(4).expand(24, 4, 4),
         joints=torch.zeros(24, 3),
         pose=canonical_pose(),
@@ -299,3 +301,33 @@ def test_field_answers_alike_on_every_device(device):
     there = off_the_start(make(SMALL)).double().to(device)
     found = there(x.to(device), pose.to(device), turns.to(device))
     torch.testing.assert_close([found.sdf.cpu(), found.color.cpu()], [expected.sdf, expected.color])
+
+
+def test_fine_levels_of_the_base_branch_vary_near_the_named_parts_alone():
+    field = off_the_start(make(replace(ABLATIONS["bands by part"], detail_voxels=(0.02,), radius=0.02)))
+    x = BODY.vertices
+    away = torch.cdist(x, x[x[:, 1] > -0.02]).amin(1)
+    fine = field.low_grid(x)[:, -SMALL.features :]
+    reach = 0.02 + 3 * 0.02 * 3**0.5
+    assert (away > reach).any()
+    far = fine[away > reach]
+    torch.testing.assert_close(far, far[:1].expand_as(far))
+    assert fine[away == 0].std(0).min() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"detail_parts": ("nose",)}, "names 'nose'; the joints are pelvis"),
+        ({"detail_voxels": (0.02,), "detail_parts": ()}, "should name a joint or several"),
+        ({"detail_voxels": (0.0,)}, "detail_voxels"),
+    ],
+)
+def test_refuses_parts_and_spacings_that_do_not_exist(changes, said):
+    with pytest.raises(ValueError, match=said):
+        replace(SMALL, **changes)
+
+
+def test_parts_without_a_vertex_are_named():
+    with pytest.raises(ValueError, match="no vertex of the body belongs to left_hand"):
+        points_of(BODY, ("left_hand",))

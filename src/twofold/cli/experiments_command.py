@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from twofold.reproduce.executors import Executor
     from twofold.reproduce.experiments import PlannedCell
 
-TableName = Literal["main", "subjects", "wild", "ablation", "frequency", "consistency", "masks", "figures"]
+TableName = Literal["main", "subjects", "wild", "ablation", "frequency", "beyond", "consistency", "masks", "figures"]
 Cluster = Literal["slurm", "local", "debug"]
 
 
@@ -44,7 +44,8 @@ def reproduce(
     """Make one of the paper's tables, or its figures: train and measure what is missing, reuse all the rest.
 
     Args:
-        table: main, subjects, wild, ablation, frequency, consistency, masks; or figures, of what the others trained.
+        table: main, subjects, wild, ablation, frequency, beyond, consistency, masks; or figures, of what the others
+            trained.
         data: studio (synthetic subjects), real (captures/real), a capture folder, or a folder of capture folders.
         out: Folder for runs, tables and figures; the same one finds again what is done.
         recipe: quick (on feature grids), fast or released (the paper's networks); baselines likewise.

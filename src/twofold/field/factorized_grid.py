@@ -4,6 +4,7 @@ The low branch sees only coarse grid levels and the body; the high branch sees f
 branch's features. Distances, colours, gates and losses are those of the network form in `factorized`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -13,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from twofold.body.skeleton import PosedBody
+from twofold.body.skeleton import JOINT_NAMES, PosedBody
 from twofold.config import require_within
-from twofold.field.fused import FusedField, Net
+from twofold.field.fused import FusedField
 from twofold.field.grids import (
     FeatureGrid,
     Lattices,
@@ -26,10 +27,15 @@ from twofold.field.grids import (
     node_positions,
 )
 from twofold.field.output import FieldOutput
+from twofold.field.small_net import SmallNet
 from twofold.geometry.surfaces import nearest_vertices
 
 UNOBSERVED, OBSERVED = 0.1, 0.5
 """How well the surface has to be observed for the pose-dependent branch to have any effect, and its whole effect."""
+
+
+DETAILED = ("head", "left_wrist", "right_wrist", "left_hand", "right_hand", "left_foot", "right_foot")
+"""Faces, hands and shoes: what neither bends much nor is covered by cloth that folds."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,10 @@ class GridFieldConfig:
     """Grid spacings of the pose-independent branch, metres."""
     high_voxels: tuple[float, ...] = (0.02, 0.01)
     """Grid spacings of the pose-dependent branch, metres."""
+    detail_voxels: tuple[float, ...] = ()
+    """Further spacings of the pose-independent branch near `detail_parts`, metres: frequency bands by body part."""
+    detail_parts: tuple[str, ...] = DETAILED
+    """Joints whose skin looks much the same in every pose, so that the pose-independent branch can hold its details."""
     features: int = 4
     """Numbers per grid node."""
     width: int = 32
@@ -63,9 +73,13 @@ class GridFieldConfig:
         """Refuses grids without levels or numbers, and those that fill any memory."""
         if not self.low_voxels or not self.high_voxels:
             raise ValueError("low_voxels and high_voxels should each name a spacing or several")
+        if unknown := set(self.detail_parts) - set(JOINT_NAMES):
+            raise ValueError(f"detail_parts names {sorted(unknown)[0]!r}; the joints are {', '.join(JOINT_NAMES)}")
+        if self.detail_voxels and not self.detail_parts:
+            raise ValueError("detail_parts should name a joint or several where detail_voxels names spacings")
         require_within(
-            self, low_voxels=(0.003, 1), high_voxels=(0.003, 1), features=(1, 64), width=(1, 1024), shared=(1, 256),
-            pose_code=(1, 1024), radius=(0.005, 0.5), gate_width=(1e-4, 10),
+            self, low_voxels=(0.003, 1), high_voxels=(0.003, 1), detail_voxels=(0.003, 1), features=(1, 64),
+            width=(1, 1024), shared=(1, 256), pose_code=(1, 1024), radius=(0.005, 0.5), gate_width=(1e-4, 10),
         )  # fmt: skip
 
     def build(self, body: PosedBody, pose_size: int = 69, generator: torch.Generator | None = None) -> "GridField":
@@ -73,45 +87,16 @@ class GridFieldConfig:
         return GridField(self, body, pose_size, generator)
 
 
-class SmallNet(nn.Module):
-    """Two hidden layers whose input gradient is a second, hand-written pass."""
+def points_of(body: PosedBody, joints: Sequence[str]) -> Float[np.ndarray, "n 3"]:
+    """Canonical vertices of the body that follow one of the joints more than any other, metres.
 
-    def __init__(
-        self, inputs: int, width: int, outputs: int, condition: int, generator: torch.Generator | None
-    ) -> None:
-        """He-initialised layers; the last one starts near zero, so a branch starts as a small correction."""
-        super().__init__()
-        self.first = nn.Linear(inputs, width)
-        self.second = nn.Linear(width, width)
-        self.last = nn.Linear(width, outputs)
-        self.condition = nn.Linear(condition, width, bias=False) if condition else None
-        for layer, gain in ((self.first, 1.0), (self.second, 1.0), (self.last, 0.1)):
-            nn.init.kaiming_normal_(layer.weight, generator=generator)
-            layer.weight.data *= gain
-            nn.init.zeros_(layer.bias)
-        if self.condition is not None:
-            nn.init.kaiming_normal_(self.condition.weight, generator=generator)
-
-    def forward(self, x: Tensor, condition: Tensor | None) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """Outputs and the tape that `pullback` needs."""
-        first, bias, *_ = self.at(condition)
-        a = F.relu(F.linear(x, first, bias))
-        b = F.relu(self.second(a))
-        return self.last(b), (a, b)
-
-    def at(self, condition: Tensor | None) -> Net:
-        """Weight and bias of each layer, with the condition in the first bias."""
-        bias = self.first.bias
-        if self.condition is not None and condition is not None:
-            # One pose a call: its part of the first layer is a bias, not a column of every sample.
-            bias = bias + self.condition(condition)
-        return self.first.weight, bias, self.second.weight, self.second.bias, self.last.weight, self.last.bias
-
-    def pullback(self, tape: tuple[Tensor, Tensor], cotangent: Tensor) -> Tensor:
-        """Cotangent of the input from that of the output."""
-        a, b = tape
-        u = (cotangent @ self.last.weight) * (b > 0)
-        return ((u @ self.second.weight) * (a > 0)) @ self.first.weight
+    Raises:
+        ValueError: no vertex does.
+    """
+    own = torch.isin(body.weights.argmax(1), torch.tensor([JOINT_NAMES.index(name) for name in joints]).to(body.faces))
+    if not own.any():
+        raise ValueError(f"no vertex of the body belongs to {', '.join(joints)}")
+    return body.canonical_vertices[own].detach().cpu().numpy().astype(np.float32)
 
 
 class _Geometry:
@@ -160,7 +145,11 @@ class GridField(nn.Module):
             self.pose_code = nn.Linear(pose_size, code, bias=False)
             nn.init.normal_(self.pose_code.weight, std=0.3, generator=generator)
         if self.has_low:
-            self.low_grid = FeatureGrid(points, config.low_voxels, config.features, config.radius, generator)
+            voxels, levels = config.low_voxels + config.detail_voxels, None
+            if config.detail_voxels:
+                detailed = points_of(body, config.detail_parts)
+                levels = [points] * len(config.low_voxels) + [detailed] * len(config.detail_voxels)
+            self.low_grid = FeatureGrid(points, voxels, config.features, config.radius, generator, levels)
             size = self.low_grid.size
             self.low_sdf = SmallNet(size, width, 1 + shared, low_code, generator)
             self.low_color = SmallNet(size + shared, width, 3 + shared, low_code, generator)

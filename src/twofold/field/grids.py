@@ -5,6 +5,7 @@ frequencies that it can hold just as the octaves of a Fourier encoding do (half 
 cost far less than a wide network.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +36,10 @@ class Lattices:
 
 
 def build_lattices(
-    points: Float[np.ndarray, "n 3"], voxels: tuple[float, ...], radius: float
+    points: Float[np.ndarray, "n 3"],
+    voxels: tuple[float, ...],
+    radius: float,
+    by_level: Sequence[Float[np.ndarray, "_ 3"]] | None = None,
 ) -> tuple[Lattices, Float[np.ndarray, "N 3"]]:
     r"""The nodes within `radius` metres (plus a cell's diagonal) of surface points, for each spacing.
 
@@ -46,15 +50,24 @@ def build_lattices(
     >>> lattices.place[:, 3], len(positions) == int(lattices.rows.max()) + 1
     (tensor([10., 20.]), True)
 
+    Args:
+        points: of the surface, metres.
+        voxels: spacing of each level, metres.
+        radius: how far from the points features exist, metres.
+        by_level: points of each level, where they differ: a level may cover some parts of the body only.
+
     Returns:
         the lattices, and the position of each table row (a level's first row stands for everywhere else).
     """
     rows, places, shapes, positions = [], [], [], []
     count = begin = 0
-    for voxel in voxels:
+    for level, voxel in enumerate(voxels):
+        points = points if by_level is None else by_level[level]
         reach = radius + np.sqrt(3) * voxel
-        low = points.min(0) - reach - voxel
-        shape = np.ceil((points.max(0) + reach + voxel - low) / voxel).astype(int) + 1
+        # Of a part of the body two more layers, which hold no nodes: what lies outside is everywhere else there, too.
+        margin = reach + (1 if by_level is None else 3) * voxel
+        low = points.min(0) - margin
+        shape = np.ceil((points.max(0) + margin - low) / voxel).astype(int) + 1
         empty = np.ones(shape, dtype=bool)
         empty[tuple(np.round((points - low) / voxel).astype(int).T)] = False
         away = np.asarray(ndimage.distance_transform_edt(empty))
@@ -270,11 +283,11 @@ class FeatureGrid(nn.Module):
 
     def __init__(
         self, points: Float[np.ndarray, "n 3"], voxels: tuple[float, ...], features: int, radius: float,
-        generator: torch.Generator | None = None,
+        generator: torch.Generator | None = None, by_level: Sequence[Float[np.ndarray, "_ 3"]] | None = None,
     ) -> None:  # fmt: skip
-        """Features near zero at the nodes within `radius` metres of `points`."""
+        """Features near zero at the nodes within `radius` metres of `points`, or of those of each level."""
         super().__init__()
-        lattices, _ = build_lattices(points, voxels, radius)
+        lattices, _ = build_lattices(points, voxels, radius, by_level)
         # Rebuilt from the body when a run is loaded, hence not part of its state.
         self.register_buffer("rows", lattices.rows, persistent=False)
         self.register_buffer("place", lattices.place, persistent=False)

@@ -198,6 +198,13 @@ ABLATIONS: dict[str, dict[str, object]] = {
 """The paper's ablations by what they change in the field; see `ablation`."""
 
 
+BEYOND: dict[str, dict[str, object]] = {"part_bands": {"detail_voxels": (0.03, 0.015)}}
+"""Variants that the paper does not have, by what they change in a field on feature grids.
+
+"part_bands": the pose-independent branch, which ends at 6 cm elsewhere, holds details of face, hands and shoes.
+"""
+
+
 def has_grids(recipe: Recipe) -> bool:
     """Whether the branches are feature grids, whose frequencies are voxel sizes, and not networks."""
     return not isinstance(recipe.method.field, FactorizedFieldConfig)
@@ -207,16 +214,20 @@ def ablation(name: str, start: Recipe) -> Recipe:
     """One of the paper's ablations of a recipe.
 
     Args:
-        name: one of `ABLATIONS`; or other frequencies. "[a]" is the pose-dependent branch alone and "[x,y]" are both
-            branches: of networks a number is the octaves of the encoding ("[5,10]"), of feature grids the finest
+        name: one of `ABLATIONS` or `BEYOND`; or other frequencies. "[a]" is the pose-dependent branch alone and
+            "[x,y]" are both branches: of networks a number is the octaves of the encoding ("[5,10]"), of feature grids the finest
             spacing ("[6cm,1cm]"), above which lies one level of twice that.
         start: the recipe of the full model.
 
     Raises:
-        ValueError: there is no such ablation, or the frequencies are named as the other kind of field has them.
+        ValueError: there is no such ablation, or it is named as, or exists only for, the other kind of field.
     """
     losses, field = start.method.losses, start.method.field
     changes: dict[str, object] = dict(ABLATIONS.get(name, {}))
+    if name in BEYOND:
+        if not has_grids(start):
+            raise ValueError(f"{name!r} exists for feature grids only; {start.name} has networks")
+        changes = dict(BEYOND[name])
     unit = "" if isinstance(field, FactorizedFieldConfig) else "cm"
     if re.fullmatch(rf"\[[\d.]+{unit}(, ?[\d.]+{unit})?\]", name):
         frequencies = [float(number) for number in re.findall(r"[\d.]+", name)]
@@ -226,9 +237,9 @@ def ablation(name: str, start: Recipe) -> Recipe:
                 changes[f"{branch}_voxels"] = (0.02 * frequency, 0.01 * frequency)
             else:
                 changes[f"{branch}_octaves"] = int(frequency)
-    elif name not in ABLATIONS:
+    elif name not in ABLATIONS and name not in BEYOND:
         bands = "[a] and [x,y] in octaves" if not unit else "[a] and [x,y] in centimetres, such as [6cm,1cm]"
-        raise ValueError(f"no ablation {name!r} of {start.name}; there are {', '.join(ABLATIONS)}, {bands}")
+        raise ValueError(f"no ablation {name!r} of {start.name}; there are {', '.join([*ABLATIONS, *BEYOND])}, {bands}")
     field = replace(field, **changes)
     if name in ("wo_s1c1", "wo_s2c2", "wo_common_loss", "wo_comm") or field.branches != "both":
         losses = replace(losses, common=0.0)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from twofold.errors import TwofoldError
-from twofold.methods.factorized_recipes import ABLATIONS, ablation, demo_recipe, has_grids
+from twofold.methods.factorized_recipes import ABLATIONS, BEYOND, ablation, demo_recipe, has_grids
 from twofold.methods.table import RECIPES, with_settings
 from twofold.recipe import Recipe
 from twofold.reproduce.cells import Cell
@@ -127,6 +127,25 @@ def ablation_rows(name: RecipeName, synthetic: bool) -> list[TableRow]:
     return [*rows, TableRow("full", "Ours", "Ours", lambda: base_recipe(name, synthetic))]
 
 
+BEYOND_LABELS = {"part_bands": "Bands by body part"}
+
+
+def beyond_rows(name: RecipeName, synthetic: bool) -> list[TableRow]:
+    """Variants that the paper leaves to others, and the full model.
+
+    Raises:
+        TwofoldError: the recipe has networks; the variants are changes of feature grids.
+    """
+    if not has_grids(base_recipe(name, synthetic)):
+        raise TwofoldError(f"The table beyond needs feature grids: --recipe quick; {name} has networks.")
+
+    def varied(key: str) -> Callable[[], Recipe]:
+        return lambda: ablation(key, base_recipe(name, synthetic))
+
+    rows = [TableRow(key, BEYOND_LABELS[key], BEYOND_LABELS[key], varied(key)) for key in BEYOND]
+    return [*rows, TableRow("full", "Ours", "Ours", lambda: base_recipe(name, synthetic))]
+
+
 FREQUENCIES = ((5,), (6,), (8,), (10,), (6, 6), (6, 8), (8, 8), (6, 10), (8, 10), (10, 10))
 """The paper's, in octaves: [a] is the pose-dependent branch alone."""
 GRID_CM = {5: 6, 6: 4, 8: 2, 10: 1}
@@ -202,6 +221,11 @@ EXPERIMENTS: dict[str, Experiment] = {
         "Ablations", (*_image_columns("PSNR", "SSIM", "LPIPS"), replace(_GEOMETRY[2])), ablation_rows
     ),
     "frequency": Experiment("Frequencies of the two branches", _image_columns("PSNR", "SSIM", "LPIPS"), frequency_rows),
+    "beyond": Experiment(
+        "Beyond the paper: frequency bands that depend on the part of the body",
+        (*_image_columns("PSNR", "SSIM", "LPIPS"), replace(_GEOMETRY[2])),
+        beyond_rows,
+    ),
     "consistency": Experiment(
         "Consistency of successive frames: Horn-Schunck flow",
         (

@@ -134,6 +134,7 @@ PRINTED: dict[str, dict[str, Numbers]] = {
     },
     "ablation": {AVERAGE: _named(_ABLATION, THREE)},
     "frequency": {AVERAGE: _named(_FREQUENCY, THREE)},
+    "beyond": {},
     "consistency": {AVERAGE: {row: {"flow": number} for row, number in _FLOW.items()}},
     "masks": {subject: _MASKED[subject] | rows for subject, rows in _UNMASKED.items()},
 }  # fmt: skip
@@ -164,6 +165,9 @@ NOTES: dict[str, tuple[str, ...]] = {
     "frequency": (
         "The paper's full model on subject 394 has other numbers in its table of ablations (30.68, 0.967, 29.74).",
         "The paper trains and prints [10] once and shows it as w/o {s1, c1}, too.",
+    ),
+    "beyond": (
+        "The paper gives all parts of the body the same bands and leaves others open; it has no numbers of these.",
     ),
     "consistency": (
         "The paper does not define its flow score; the number in parentheses cannot be compared with ours.",
