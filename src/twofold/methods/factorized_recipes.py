@@ -215,8 +215,8 @@ def ablation(name: str, start: Recipe) -> Recipe:
 
     Args:
         name: one of `ABLATIONS` or `BEYOND`; or other frequencies. "[a]" is the pose-dependent branch alone and
-            "[x,y]" are both branches: of networks a number is the octaves of the encoding ("[5,10]"), of feature grids the finest
-            spacing ("[6cm,1cm]"), above which lies one level of twice that.
+            "[x,y]" are both branches: of networks a number is the octaves of the encoding ("[5,10]"), of feature grids
+            the finest spacing ("[6cm,1cm]"), above which lies one level of twice that.
         start: the recipe of the full model.
 
     Raises:
