@@ -2,10 +2,10 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from twofold.files import json_text, write_together
 from twofold.reproduce.experiments import EXPERIMENTS, Column, PlannedCell, TableRow
@@ -143,9 +143,29 @@ def markdown(table: FilledTable) -> str:
             words.append(shown + (f" ({theirs})" if theirs else ""))
         body.append(words)
     rows = "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in words)} |" for words in body)
-    about = ", ".join(f"{name} {value}" for name, value in table.about.items() if value not in ((), [], None, ""))
+    about = _about(table.about)
     notes = "\n".join(f"- {note}" for note in table.notes)
     return f"# {table.title}\n\nMade by `twofold reproduce {table.name}`: {about}.\n\n{rows}\n\n{notes}\n"
+
+
+def _about(about: Mapping[str, Any]) -> str:
+    """Where a table comes from, for people.
+
+    >>> _about({"data": "studio", "subjects": ["studio 101", "studio 102"], "seeds": 2, "settings": []})
+    'data studio; subjects studio 101, studio 102; seeds 2'
+    >>> _about({"measures": {"max_images": 30, "video": True, "weights": None}})
+    'max_images 30, video True'
+    """
+    said: list[str] = []
+    for name, value in about.items():
+        if isinstance(value, Mapping):
+            parts = cast("Mapping[str, Any]", value)
+            said.append(", ".join(f"{key} {part}" for key, part in parts.items() if part not in (None, False)))
+        elif isinstance(value, (list, tuple)) and value:
+            said.append(f"{name} {', '.join(map(str, cast('Sequence[Any]', value)))}")
+        elif value not in ((), [], None, ""):
+            said.append(f"{name} {value}")
+    return "; ".join(said)
 
 
 _LATEX = {
