@@ -11,7 +11,6 @@ from twofold.field.networks import (
     NetworkConfig,
     _processor_flags,
     bf16_is_fast,
-    softplus,
 )
 
 SMALL = NetworkConfig(
@@ -117,28 +116,6 @@ def test_gradcheck_through_the_pullback():
 
     parameters = list(network.parameters())
     assert torch.autograd.gradcheck(answer, (x.requires_grad_(), constant.requires_grad_(), *parameters))
-
-
-def test_softplus_is_accurate_to_3e7():
-    z = torch.cat([torch.linspace(-3, 3, 100_001), torch.tensor([0.0, 1e-8, -1e-8, 40.0, -40.0, 1e4, -1e4])])
-    value, slope = softplus(z)
-    exact = torch.logaddexp(z.double() * 100, torch.zeros(())) / 100
-    assert ((value - exact).abs() / z.abs().clamp_min(1)).max() < 3e-7
-    assert (slope - torch.sigmoid(100 * z.double())).abs().max() < 3e-7
-    assert value.isfinite().all()
-    assert slope.isfinite().all()
-
-
-def test_softplus_gives_nothing_denormal():
-    parts = softplus(torch.linspace(-2, 2, 100_001))
-    for part in parts:
-        assert not ((part != 0) & (part.abs() < torch.finfo(torch.float32).tiny)).any()
-
-
-def test_softplus_is_differentiable_twice():
-    z = torch.linspace(-0.05, 0.05, 21, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(softplus, (z,))
-    assert torch.autograd.gradgradcheck(softplus, (z,))
 
 
 def test_sphere_start_is_near_the_distance_to_a_sphere():
