@@ -130,7 +130,11 @@ def _benchmarks(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _studies(results: dict[str, Any]) -> list[str]:
     """A section for each stored study."""
-    titles = {"study-ablation": "## What each part of the factorization is worth"}
+    titles = {
+        "study-ablation": "## What each part of the factorization is worth",
+        "study-beyond": "## Beyond the paper: frequency bands by body part",
+        "study-frequency": "## Frequencies of the two branches",
+    }
     return [
         f"{titles.get(name, f'## Study {name[6:]}')}\n\n{section(study, _table)}"
         for name, study in results.items()
