@@ -1,6 +1,8 @@
-"""Collects finished cells of `twofold reproduce` into one stored result: every number by row, subject and seed.
+r"""Collects finished cells of `twofold reproduce` into one stored result: every number by row, subject and seed.
 
 python -m benchmarks.study reproduce/tables/ablation-studio-quick.json [--name ablation]
+python -m benchmarks.study reproduce/tables/beyond-studio-quick.json \
+    --full-of reproduce/tables/ablation-studio-quick.json
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import store
+from benchmarks.study_section import FULL
 from twofold.reproduce.pose_distance import PROTOCOL, binned
 
 METRICS = {
@@ -59,15 +62,47 @@ def collect(table: dict[str, Any], cells: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def with_full_model(study: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """A study with the full model of another one in place of its own: the same training under a table's other name.
+
+    Args:
+        study: from `collect`.
+        other: from `collect`, of the same subjects and steps.
+
+    Raises:
+        ValueError: it was trained otherwise.
+    """
+    (name,) = [row for row in other["rows"] if row in FULL]
+    for key in ("data", "recipe", "settings"):
+        if study["about"].get(key) != other["about"].get(key):
+            raise ValueError(
+                f"{key} is {study['about'].get(key)!r} in one table, {other['about'].get(key)!r} in the other"
+            )
+    merged = dict(study)
+    for part in ("rows", "steps", "printed"):
+        merged[part] = {row: v for row, v in study[part].items() if row not in FULL} | {name: other[part][name]}
+    bins = study["extreme"]["bins"] | {name: other["extreme"]["bins"][name]}
+    merged["extreme"] = study["extreme"] | {"bins": bins}
+    own = [cell for cell in study["cells"] if cell["row"] not in FULL]
+    merged["cells"] = own + [cell for cell in other["cells"] if cell["row"] == name]
+    return merged
+
+
 def main() -> None:
     """Collects and stores."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("table", type=Path)
     parser.add_argument("--name", default="")
+    parser.add_argument("--full-of", type=Path, help="table whose full model is compared with")
     arguments = parser.parse_args()
-    table = json.loads(arguments.table.read_text("utf-8"))
-    name = arguments.name or table["experiment"]
-    store(f"study-{name}", collect(table, arguments.table.parent.parent / "cells"))
+
+    def collected(file: Path) -> dict[str, Any]:
+        return collect(json.loads(file.read_text("utf-8")), file.parent.parent / "cells")
+
+    study = collected(arguments.table)
+    if arguments.full_of is not None:
+        study = with_full_model(study, collected(arguments.full_of))
+    store(f"study-{arguments.name or study['experiment']}", study)
 
 
 if __name__ == "__main__":

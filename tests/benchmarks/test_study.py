@@ -5,7 +5,7 @@ import json
 import pytest
 from stub_cells import store_results
 
-from benchmarks.study import collect
+from benchmarks.study import collect, with_full_model
 from twofold.reproduce.cells import CELLS, store_cell
 from twofold.reproduce.experiments import planned
 from twofold.reproduce.sources import StudioSource
@@ -34,3 +34,30 @@ def test_table_without_finished_cells_gives_an_empty_study(tmp_path):
     assert study["rows"] == {}
     assert study["extreme"]["bins"] == {}
     assert pytest.approx(0) == len(study["cells"])
+
+
+def collected(name, rows, folder, value, settings=()):
+    plan = planned(name, [StudioSource(101)], "quick", 1, rows, ["training.steps=7"])
+    for place in plan:
+        store_results(store_cell(place.cell, folder), value)
+    about = {"data": "studio", "recipe": "quick", "settings": list(settings)}
+    return collect(json.loads(json.dumps(as_json(fill(name, plan, folder, about)))), folder / CELLS)
+
+
+def test_full_model_of_another_table_takes_the_place_of_a_missing_one(tmp_path):
+    study = collected("beyond", ("part_bands",), tmp_path / "a", 20.0)
+    other = collected("ablation", ("wo_feat", "full"), tmp_path / "b", 30.0)
+    merged = with_full_model(study, other)
+    assert (
+        set(merged["rows"]) == set(merged["steps"]) == set(merged["extreme"]["bins"]) == {"Bands by body part", "Ours"}
+    )
+    assert merged["rows"]["Ours"] == other["rows"]["Ours"]
+    assert [cell["row"] for cell in merged["cells"]] == ["Bands by body part", "Ours"]
+    assert "Ours" not in study["rows"], "the study itself stays"
+
+
+def test_full_model_that_was_trained_otherwise_is_refused(tmp_path):
+    study = collected("beyond", ("part_bands",), tmp_path / "a", 20.0)
+    other = collected("ablation", ("full",), tmp_path / "b", 30.0, ["training.steps=8"])
+    with pytest.raises(ValueError, match="settings is"):
+        with_full_model(study, other)
