@@ -12,11 +12,10 @@ from torch import Tensor
 
 from twofold.capture.types import Capture
 from twofold.capture.validate import require, validate
-from twofold.errors import TwofoldError
 from twofold.evaluation import MAX_IMAGES, measure
 from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
-from twofold.methods.table import RECIPES, with_settings
+from twofold.methods.table import chosen_recipe
 from twofold.outputs.mesh import posed_surface
 from twofold.outputs.views import RenderedImage, render_image
 from twofold.training import loop
@@ -35,6 +34,7 @@ def train(
     seed: int = 0,
     device: str = "auto",
     progress: Callable[[Progress], None] | None = None,
+    steps: int | None = None,
 ) -> Avatar:
     """Trains an avatar of a capture and leaves the run in a folder, as `twofold train` does.
 
@@ -46,14 +46,13 @@ def train(
         seed: of everything random.
         device: "auto", "cpu", "cuda" or "cuda:N".
         progress: called after each step with its losses.
+        steps: of the training, all stages together, with the recipe's whole schedule scaled to it.
 
     Raises:
         TwofoldError: a faulty capture, an unknown recipe or setting, a folder that is not free, a training that
             diverges.
     """
-    if recipe not in RECIPES:
-        raise TwofoldError(f"There is no recipe {recipe!r}; there are {', '.join(RECIPES)}.")
-    chosen = with_settings(RECIPES[recipe](), [f"seed={seed}", *settings])
+    chosen = chosen_recipe(recipe, settings, seed, steps=steps)
     require(validate(capture.folder), capture.folder)
     return loop.train(capture, chosen, Path(out), choose_device(device), progress=progress)
 

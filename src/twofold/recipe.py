@@ -1,9 +1,18 @@
 """A recipe: all that decides a run beside its capture. Configuration only."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from twofold.config import MAX_SEED, require_within
+
+
+def scaled_count(count: int, factor: float) -> int:
+    """A number of steps or epochs multiplied, at least one; zero, which means from the start or never, stays.
+
+    >>> scaled_count(300, 0.5), scaled_count(1, 0.1), scaled_count(0, 3.0)
+    (150, 1, 0)
+    """
+    return max(round(count * factor), 1) if count else 0
 
 
 @dataclass(frozen=True)
@@ -85,6 +94,15 @@ class TrainingConfig:
         )  # fmt: skip
         if not all(0 <= beta < 1 for beta in self.adam_betas):
             raise ValueError(f"adam_betas={self.adam_betas} should lie in 0..1, below 1")
+
+    def scaled(self, factor: float) -> "TrainingConfig":
+        """The same schedule over so many times the steps. Checkpoints and previews come as often as before."""
+        return replace(
+            self,
+            steps=scaled_count(self.steps, factor),
+            milestones=tuple(scaled_count(epoch, factor) for epoch in self.milestones),
+            warmup=scaled_count(self.warmup, factor),
+        )
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,9 @@ class CloudConfig(MethodConfig):
     def __post_init__(self):
         require_within(self, width=(1, 1024), samples=(2, 1024), rate=(0, 1), surface=(0, 1e6))
 
+    def scaled(self, factor):
+        return self
+
     def build(self, subject, seed=0):
         return CloudAvatar(self, subject, seed)
 

@@ -12,7 +12,14 @@ from density_method import CloudConfig, add_to_table, cloud
 import twofold
 from twofold.cli.main import main
 from twofold.inputs import read_json
-from twofold.methods.table import RECIPES, recipe_from_dict, recipe_to_dict, with_settings
+from twofold.methods.table import (
+    RECIPES,
+    chosen_recipe,
+    recipe_from_dict,
+    recipe_to_dict,
+    with_settings,
+    with_steps,
+)
 from twofold.outputs.mesh import posed_surface
 from twofold.training.run import load, read_checkpoint
 
@@ -77,6 +84,65 @@ def test_old_names_of_settings_are_understood():
     recipe = with_settings(RECIPES["quick"](), ["training.rate_pose=1e-4", "method.sampler.stray=0.01"])
     assert recipe.method.rates.pose == 1e-4
     assert recipe.method.sampler.miswarp_slack == 0.01
+
+
+def numbers(data, path=""):
+    """Every setting of a stored recipe by its whole name."""
+    if not isinstance(data, dict):
+        return {path: data}
+    return {k: v for name, value in data.items() for k, v in numbers(value, f"{path}.{name}" if path else name).items()}
+
+
+PERIODS = {
+    "training.decay_from", "training.images_per_step", "training.epochs", "training.checkpoint_every",
+    "training.preview_every", "method.shell_refresh", "method.pose.zero_every", "method.pose.epochs",
+    "method.skeletal.volume_every", "method.features_every", "method.sampler.step", "method.prefit.steps",
+}  # fmt: skip
+"""Settings that are named like a schedule and are shares of it, how often something is repeated, or none."""
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_the_whole_schedule_of_a_recipe_is_scaled_with_its_steps(name):
+    recipe = RECIPES[name]()
+    total = recipe.method.total_steps(recipe.training)
+    half = with_steps(recipe, total // 2)
+    assert half.method.total_steps(half.training) == total // 2
+    before, after = (numbers(recipe_to_dict(r)) for r in (recipe, half))
+    timed = ("step", "epoch", "every", "from", "until", "start", "full", "refresh", "warmup", "milestones")
+    for key, value in before.items():
+        if key in PERIODS or not any(word in key.rpartition(".")[2] for word in timed):
+            assert key == "method.separation.pace" or after[key] == value, key
+        elif value != after[key]:
+            old, new = (v if isinstance(v, list) else [v] for v in (value, after[key]))
+            assert new == pytest.approx([v / 2 for v in old], abs=0.51), key
+        else:
+            assert value in (0, 1, [], None), key
+    assert after["training.decay"] == before["training.decay"]
+    assert with_steps(recipe, total) == recipe
+
+
+def test_separation_ends_with_the_weights_of_the_long_training():
+    recipe = RECIPES["vid2avatar_fast"]()
+    short = with_steps(recipe, recipe.training.steps // 4).method.separation
+    assert short.pace == 4 * recipe.method.separation.pace
+    assert with_steps(recipe, 1).method.separation.pace == 1000
+
+
+def test_settings_hold_whatever_the_steps_change():
+    recipe = chosen_recipe("humannerf_fast", ["training.steps=7", "method.skeletal.motion_from=3"], 5, steps=1000)
+    assert (recipe.training.steps, recipe.method.skeletal.motion_from, recipe.seed) == (7, 3, 5)
+    factor = 1000 / RECIPES["humannerf_fast"]().training.steps
+    assert recipe.method.skeletal.motion_full == round(factor * RECIPES["humannerf_fast"]().method.skeletal.motion_full)
+    with pytest.raises(twofold.errors.TwofoldError, match="no recipe 'nerf'"):
+        chosen_recipe("nerf")
+
+
+def test_steps_are_shown_and_refused_on_the_command_line(tmp_path, capsys):
+    main(["train", "--recipe", "npc_fast", "--steps", "500", "--settings"])
+    shown = capsys.readouterr().out
+    assert "training.steps=300" in shown.replace(" ", "")
+    assert "steps" in refused(capsys, "train", tmp_path, "--steps", "0")
+    assert "--steps" in refused(capsys, "train", "--resume", tmp_path, "--steps", "10")
 
 
 def test_nothing_above_methods_asks_which_method_it_has():

@@ -51,6 +51,7 @@ def train(
     split: SplitName | None = None,
     live: Annotated[LiveView, tyro.conf.OmitArgPrefixes] = NO_VIEW,
     complete: Literal["on", "off"] | None = None,
+    steps: int | None = None,
 ) -> None:
     """Train an avatar from a capture folder.
 
@@ -68,9 +69,15 @@ def train(
         split: Whose training and test images, for a data set.
         live: A viewer in the browser.
         complete: Whether regions that no training image shows are completed; by default as the recipe has it.
+        steps: Steps of the training, all stages together; the whole schedule of the recipe (decay, warm-up, when parts
+            of the method begin) is scaled to it. --set training.steps=N changes that number alone.
     """
+    from twofold.methods.table import chosen_recipe
+
+    within(steps=(steps, 1, 100_000_000))
+    completion = None if complete is None else complete == "on"
     if settings:
-        _show_settings(recipe, set, seed, complete)
+        _show_settings(chosen_recipe(recipe, set, seed, completion, steps))
         return
     from twofold.capture.folder import read_capture
     from twofold.capture.validate import require, validate
@@ -80,12 +87,12 @@ def train(
     from twofold.training.run import RECIPE, choose_device, find_capture, read_recipe
 
     if resume is None:
-        wanted = _chosen_recipe(recipe, set, seed, complete)
+        wanted = chosen_recipe(recipe, set, seed, completion, steps)
         chosen, folder, source = _new_run(capture, out, recipe, wanted, body, split)
-    elif set or out or seed or recipe != "quick" or body or split or complete:
+    elif set or out or seed or recipe != "quick" or body or split or complete or steps:
         raise TwofoldError(
-            "--resume continues a run as it was begun; leave --set, --out, --seed, --recipe, --body, --split and "
-            "--complete out, or start a new run."
+            "--resume continues a run as it was begun; leave --set, --out, --seed, --recipe, --body, --split, "
+            "--complete and --steps out, or start a new run."
         )
     else:
         require_run(resume)
@@ -119,21 +126,11 @@ def _note(done: "Progress") -> str:
     return f"step {done.step}  loss {sum(done.losses.values()):.4f}  {done.psnr:.1f} dB"
 
 
-def _show_settings(recipe: str, overrides: tuple[str, ...], seed: int, complete: str | None) -> None:
+def _show_settings(recipe: "Recipe") -> None:
     """Every setting on a line of standard output."""
     from twofold.config import describe
 
-    print("\n".join(describe(_chosen_recipe(recipe, overrides, seed, complete))))
-
-
-def _chosen_recipe(name: str, overrides: tuple[str, ...], seed: int, complete: str | None) -> "Recipe":
-    """A recipe with what the command line changes in it."""
-    from twofold.methods.table import RECIPES, with_completion, with_settings
-
-    recipe = RECIPES[name]()
-    if complete is not None:
-        recipe = with_completion(recipe, complete == "on")
-    return with_settings(recipe, [f"seed={seed}", *overrides])
+    print("\n".join(describe(recipe)))
 
 
 def _new_run(

@@ -170,6 +170,17 @@ class MethodConfig(ABC):
     def build(self, subject: Subject, seed: int = 0) -> "Avatar":
         """An untrained avatar of a subject."""
 
+    def total_steps(self, training: TrainingConfig) -> int:
+        """Steps of a training, all stages together."""
+        return training.steps
+
+    @abstractmethod
+    def scaled(self, factor: float) -> "MethodConfig":
+        """The configuration with all that it times in steps or epochs of the training multiplied by a factor.
+
+        How often something is repeated to save time, or to keep up with the parameters, is no schedule and stays.
+        """
+
     def completing(self, on: bool) -> "MethodConfig":
         """The configuration with unobserved regions completed in training, or left as they come.
 

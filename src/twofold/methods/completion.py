@@ -1,7 +1,7 @@
 """Completion of what the training images never show: pulls the field there to values that were observed elsewhere."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from twofold.field.output import FieldOutput
 from twofold.field.surface_fill import SurfaceFill
 from twofold.geometry.surfaces import vertex_normals
 from twofold.losses import MAX_STEPS
+from twofold.recipe import scaled_count
 
 Answers = Callable[[Float[Tensor, "n 3"], Int[Tensor, "n"]], tuple[FieldOutput, ...]]
 """The field at canonical points, each beside a vertex of the body: one answer for each branch that is completed."""
@@ -64,6 +65,10 @@ class CompletionConfig:
     def active(self) -> bool:
         """Whether anything is completed."""
         return self.color > 0 or self.shape > 0
+
+    def scaled(self, factor: float) -> "CompletionConfig":
+        """The schedule over so many times the steps."""
+        return replace(self, start=scaled_count(self.start, factor), every=scaled_count(self.every, factor))
 
 
 class Completion(nn.Module):

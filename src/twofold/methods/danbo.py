@@ -52,6 +52,10 @@ class DanboConfig(MethodConfig):
         """Refuses weights that reward what they should punish."""
         require_within(self, box_volume=(0, 1e6), box_assignment=(0, 1e6))
 
+    def scaled(self, factor: float) -> "DanboConfig":
+        """See `MethodConfig.scaled`: nothing of this method is timed."""
+        return self
+
     def build(self, subject: Subject, seed: int = 0) -> "DanboAvatar":
         """An untrained avatar of a subject."""
         return DanboAvatar(self, subject, seed)
@@ -116,7 +120,7 @@ def danbo() -> Recipe:
 def danbo_fast() -> Recipe:
     """The same networks and losses; only samples near the body, one image a step, a short schedule."""
     start = danbo()
-    method = replace(start.method, boxed=affordable(start.method.boxed))
+    method = replace(start.method, boxed=affordable(start.method.boxed), rates=DanboRates(all=1e-3))
     return replace(start, name="danbo_fast", method=method, training=short_training(start.training))
 
 

@@ -25,6 +25,10 @@ class HumanNerfConfig(MethodConfig):
     skeletal: SkeletalConfig = dataclasses.field(default_factory=SkeletalConfig)
     rates: SkeletalRates = dataclasses.field(default_factory=SkeletalRates)
 
+    def scaled(self, factor: float) -> "HumanNerfConfig":
+        """See `MethodConfig.scaled`."""
+        return dataclasses.replace(self, skeletal=self.skeletal.scaled(factor))
+
     def build(self, subject: Subject, seed: int = 0) -> "HumanNerfAvatar":
         """An untrained avatar of a subject."""
         return HumanNerfAvatar(self, subject, seed)
@@ -86,12 +90,12 @@ def humannerf_fast() -> Recipe:
     """The same equations in half an hour on two cores: only likely samples, fewer of them, shortened schedules."""
     start = humannerf()
     skeletal = affordable(start.method.skeletal)
-    rates = SkeletalRates(networks=1e-3, volume=5e-5, motion=1e-4, pose=5e-5)
+    rates = SkeletalRates(networks=1e-3, volume=1e-4, motion=1e-4, pose=5e-5)
     training = dataclasses.replace(
         start.training,
-        steps=2500,
+        steps=1500,
         pixels=PixelConfig(
-            rays=768, subject_share=0.9, surroundings=8, patches=1, patch_size=16, patch_on_subject=0.8,
+            rays=256, subject_share=0.9, surroundings=8, patches=1, patch_size=16, patch_on_subject=0.8,
             reachable="body", subject="half",
         ),
         decay=0.1,

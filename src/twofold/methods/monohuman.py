@@ -54,6 +54,10 @@ class MonoHumanConfig(MethodConfig):
         two = len(self.key_frames) in (0, 2)
         require(two, f"key_frames should be two frame indices or none, not {self.key_frames}")
 
+    def scaled(self, factor: float) -> "MonoHumanConfig":
+        """See `MethodConfig.scaled`."""
+        return replace(self, skeletal=self.skeletal.scaled(factor))
+
     def build(self, subject: Subject, seed: int = 0) -> "MonoHumanAvatar":
         """An untrained avatar of a subject."""
         return MonoHumanAvatar(self, subject, seed)
@@ -229,14 +233,14 @@ def monohuman_fast() -> Recipe:
     """The same equations within reach of two cores: only likely samples, fewer of them, shortened schedules."""
     start = monohuman()
     skeletal = affordable(start.method.skeletal)
-    rates = SkeletalRates(networks=1e-3, volume=5e-6, motion=1e-4, pose=5e-5)
-    method = replace(start.method, skeletal=skeletal, rates=rates, features_every=4)
+    rates = SkeletalRates(networks=1e-3, volume=1e-5, motion=1e-4, pose=5e-5)
+    method = replace(start.method, skeletal=skeletal, rates=rates, features_every=8)
     pixels = PixelConfig(
-        rays=512, subject_share=0.9, surroundings=8, patches=1, patch_size=16, patch_on_subject=0.9,
+        rays=192, subject_share=0.9, surroundings=8, patches=1, patch_size=16, patch_on_subject=0.9,
         reachable="body", subject="half",
     )  # fmt: skip
     training = replace(
-        start.training, steps=2500, pixels=pixels, decay=0.1, decay_from=0.3, checkpoint_every=250, preview_every=500
+        start.training, steps=1500, pixels=pixels, decay=0.1, decay_from=0.3, checkpoint_every=250, preview_every=500
     )
     return replace(start, name="monohuman_fast", method=method, training=training)
 

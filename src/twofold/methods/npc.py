@@ -23,9 +23,10 @@ from twofold.methods.boxed_config import (
     short_training,
 )
 from twofold.methods.local_radiance import POSE_OCTAVES, LocalRadiance, inside_rigid
-from twofold.methods.point_networks import PointNetworks, PointWeights, ReadyPoints, surface_positions
+from twofold.methods.point_needs import require_points
+from twofold.methods.point_networks import BETA, PointNetworks, PointWeights, ReadyPoints, surface_positions
 from twofold.methods.subject import Subject
-from twofold.recipe import Recipe, TrainingConfig
+from twofold.recipe import Recipe, TrainingConfig, scaled_count
 from twofold.volume.nerf_compositing import open_density_weights, without_thin_density
 from twofold.volume.samples import Samples
 
@@ -70,6 +71,8 @@ class NpcConfig(MethodConfig):
     box_assignment: float = 1e-3
     """Weight of the term that gives each sample on the person to one box, first stage."""
     weights: PointWeights = field(default_factory=PointWeights)
+    beta: float = BETA
+    """Initial scale of the density in the second stage, metres."""
     background: float = 1.0
     """Weight of the learned background, second stage; 0 leaves it out."""
     rates: NpcRates = field(default_factory=NpcRates)
@@ -78,8 +81,16 @@ class NpcConfig(MethodConfig):
         """Refuses what no points can be made of."""
         require_within(
             self, first_steps=(1, 100_000_000), first_rays=(1, 1_000_000), first_decay=(1e-9, 1), points=(8, 5000),
-            point_voxel=(1e-3, 0.1), box_volume=(0, 1e6), box_assignment=(0, 1e6), background=(0, 1e6),
+            point_voxel=(1e-3, 0.1), beta=(1e-3, 1), box_volume=(0, 1e6), box_assignment=(0, 1e6), background=(0, 1e6),
         )  # fmt: skip
+
+    def total_steps(self, training: TrainingConfig) -> int:
+        """See `MethodConfig.total_steps`: of both stages."""
+        return self.first_steps + training.steps
+
+    def scaled(self, factor: float) -> "NpcConfig":
+        """See `MethodConfig.scaled`."""
+        return replace(self, first_steps=scaled_count(self.first_steps, factor))
 
     def build(self, subject: Subject, seed: int = 0) -> "NpcAvatar":
         """An untrained avatar of a subject, in its first stage."""
@@ -115,6 +126,15 @@ class NpcAvatar(BoxedAvatar[Shared]):
         pixels = replace(training.pixels, rays=config.first_rays)
         first = replace(training, steps=config.first_steps, decay=config.first_decay, pixels=pixels)
         return Stage("boxes", first), Stage("points", training)
+
+    def check_capture(self, capture: Capture) -> None:
+        """See `Avatar.check_capture`: every body part has to be shown, and be large enough for its points.
+
+        Raises:
+            TwofoldError: see `require_points`.
+        """
+        sizes = self.boxes().detach().cpu()[list(RIGID_PARTS)]
+        require_points(capture, sizes, self.config.points, self.config.point_voxel)
 
     def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
         """See `Avatar.prepare_training`: the second stage begins with points on the surface of the first one's field.
@@ -160,7 +180,8 @@ class NpcAvatar(BoxedAvatar[Shared]):
         """
         sizes = self.boxes().detach()
         joints = self.rest_joints.cpu()
-        self.points = PointNetworks(positions.cpu(), joints, sizes.cpu(), generator).to(self.device)
+        beta = self.config.beta
+        self.points = PointNetworks(positions.cpu(), joints, sizes.cpu(), generator, beta).to(self.device)
         self.boxes.requires_grad_(False)
         self.settings = self.config.boxed
         codes = [CODE_SPREAD * torch.randn(self.codes.shape, generator=generator) for _ in range(2)]
@@ -288,9 +309,10 @@ def npc_fast() -> Recipe:
         start.method,
         first=affordable(start.method.first),
         boxed=affordable(start.method.boxed, coarse=40, fine=20),
-        first_steps=2000, first_rays=256, first_decay=0.3, point_voxel=0.006, background=0.0,
+        first_steps=500, first_rays=192, first_decay=0.3, point_voxel=0.006, background=0.0, beta=0.02,
+        rates=NpcRates(boxes=1e-3, points=1e-3),
     )  # fmt: skip
-    return replace(start, name="npc_fast", method=method, training=short_training(start.training))
+    return replace(start, name="npc_fast", method=method, training=short_training(start.training, steps=1500))
 
 
 RECIPES: dict[str, Callable[[], Recipe]] = {"npc": npc, "npc_fast": npc_fast}

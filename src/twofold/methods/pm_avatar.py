@@ -62,6 +62,10 @@ class PmAvatarConfig(MethodConfig):
         """Refuses windows that leave nothing of a box."""
         require_within(self, box_volume=(0, 1e6), min_window=(0, 0.1))
 
+    def scaled(self, factor: float) -> "PmAvatarConfig":
+        """See `MethodConfig.scaled`: nothing of this method is timed."""
+        return self
+
     def build(self, subject: Subject, seed: int = 0) -> "PmAvatar":
         """An untrained avatar of a subject."""
         return PmAvatar(self, subject, seed)
@@ -135,7 +139,7 @@ def pm_avatar_fast() -> Recipe:
     start = pm_avatar()
     rates = PmAvatarRates(field=3e-4, radiance=1e-3)
     method = replace(start.method, boxed=affordable(start.method.boxed), rates=rates, min_window=1e-4, misses="empty")
-    return replace(start, name="pm_avatar_fast", method=method, training=short_training(start.training))
+    return replace(start, name="pm_avatar_fast", method=method, training=short_training(start.training, steps=1200))
 
 
 RECIPES: dict[str, Callable[[], Recipe]] = {"pm_avatar": pm_avatar, "pm_avatar_fast": pm_avatar_fast}

@@ -64,6 +64,7 @@ class PointNetworks(nn.Module):
         joints: of the rest pose, metres.
         half_sizes: of all boxes, metres.
         generator: draws the start.
+        beta: initial scale of the density, metres.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class PointNetworks(nn.Module):
         joints: Float[Tensor, "24 3"],
         half_sizes: Float[Tensor, "24 3"],
         generator: torch.Generator | None = None,
+        beta: float = BETA,
     ) -> None:
         super().__init__()
         self.cloud = PointCloud(positions, joints, half_sizes, generator=generator)
@@ -79,7 +81,7 @@ class PointNetworks(nn.Module):
         self.features = PointFeatures(generator)
         self.radiance = PointRadiance(generator)
         self.background = PixelBackground(generator)
-        self.raw_beta = nn.Parameter(torch.tensor(BETA))
+        self.raw_beta = nn.Parameter(torch.tensor(beta))
 
     @property
     def beta(self) -> Float[Tensor, ""]:

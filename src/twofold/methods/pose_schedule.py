@@ -1,7 +1,7 @@
 """What of the pose the pose-dependent branch sees, and when; and what of the given poses is corrected."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from twofold.config import require_within
 from twofold.losses import MAX_STEPS
+from twofold.recipe import scaled_count
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,15 @@ class PoseConfig:
         """Refuses chances and steps that there are not."""
         steps = (0, MAX_STEPS)
         require_within(self, zero_until=steps, zero_epochs=steps, zero_every=steps, drop=(0, 1), refine_from=steps)
+
+    def scaled(self, factor: float) -> "PoseConfig":
+        """The schedule over so many times the steps; zero poses later on keep their share of the epochs."""
+        return replace(
+            self,
+            zero_until=scaled_count(self.zero_until, factor),
+            zero_epochs=scaled_count(self.zero_epochs, factor),
+            refine_from=scaled_count(self.refine_from, factor),
+        )
 
 
 def condition(config: PoseConfig, pose: Float[Tensor, "24 3"], step: int | None, epoch: int) -> Float[Tensor, "P"]:

@@ -84,6 +84,8 @@ class SkeletalAvatar(Avatar[SkeletalPose]):
     ) -> tuple[RadianceOutput, dict[str, Tensor]]:
         """Density and colour of points that the skeleton brought to the T-pose, and extras of each for the losses.
 
+        Densities are in `SkeletalConfig.density_unit`.
+
         Args:
             moved: the points in the T-pose.
             observed: the same points in aligned space, metres.
@@ -212,7 +214,8 @@ class SkeletalAvatar(Avatar[SkeletalPose]):
         else:
             moved = self._moved(points, posed, self.settings.min_likelihood)
         answer, extras = self.radiance(moved, points[moved.index], posed, mode)
-        return Shaded(samples[moved.index], answer.density, answer.color, moved.likelihood, extras)
+        density = self.settings.density_unit * answer.density
+        return Shaded(samples[moved.index], density, answer.color, moved.likelihood, extras)
 
     @torch.no_grad()
     def _seen(self, samples: Samples, points: Float[Tensor, "S 3"], posed: Posed, rays: int) -> Int[Tensor, "n"]:
@@ -223,7 +226,7 @@ class SkeletalAvatar(Avatar[SkeletalPose]):
         def density(index: Tensor) -> Tensor:
             delta, likelihood = likely.delta[index], moved.likelihood[index]
             part = SkeletalPoints(moved.index[index], moved.points[index], likelihood)
-            alpha = alpha_of_density(self.density(part, posed), delta) * likelihood
+            alpha = alpha_of_density(self.settings.density_unit * self.density(part, posed), delta) * likelihood
             # The density without a likelihood that is as opaque.
             return -torch.log1p(-alpha.clamp_max(1 - 1e-6)) / delta
 
@@ -239,7 +242,7 @@ class SkeletalAvatar(Avatar[SkeletalPose]):
         require(branch in ("full", "base"), f'branch is "full" or "base"; it is {branch!r}')
         points = skin(x, x.new_ones(len(x), 1), posed.own.to_aligned[None])
         moved = self._moved(points, posed, self.settings.min_likelihood)
-        likely = self.density(moved, posed) * moved.likelihood
+        likely = self.settings.density_unit * self.density(moved, posed) * moved.likelihood
         density = torch.zeros(len(x), device=x.device).index_add(0, moved.index, likely)
         return LEVEL_SCALE * (1 - density / self.settings.level_density).clamp_min(-1)
 

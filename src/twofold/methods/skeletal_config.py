@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.config import require, require_within
+from twofold.recipe import scaled_count
 from twofold.volume.samples import Samples
 
 MAX_STEPS = 100_000_000
@@ -50,6 +51,9 @@ class SkeletalConfig:
     """How many frames are looked at."""
     guard_size: int | None = None
     """The longer side of the images that are looked at, pixels; none: as they are."""
+    density_unit: float = 1.0
+    """Density that an output of one of the density network stands for, per metre. Adam changes outputs by about as much
+    whatever their unit is, so a larger unit makes a person opaque in fewer steps."""
     level_density: float = 15.0
     """Density times likelihood on the surface of meshes, per metre."""
 
@@ -59,10 +63,21 @@ class SkeletalConfig:
             self, samples=(2, 4096), min_likelihood=(0, 1), min_weight=(0, 0.1), volume_channels=(1, 8192),
             volume_code=(1, 8192), volume_every=(1, MAX_STEPS), correct_from=(0, MAX_STEPS), motion_from=(0, MAX_STEPS),
             motion_full=(1, MAX_STEPS), squared_error=(0, 1e6), lpips=(0, 1e6), guard_steps=(1, MAX_STEPS),
-            guard_frames=(1, 10_000), guard_size=(8, 100_000), level_density=(1e-3, 1e6),
+            guard_frames=(1, 10_000), guard_size=(8, 100_000), density_unit=(1e-3, 1e4), level_density=(1e-3, 1e6),
         )  # fmt: skip
         require(1 <= len(self.volume_channels) <= 7, "volume_channels should be one to seven numbers")
         require(self.motion_from < self.motion_full, f"motion_from should be below motion_full={self.motion_full}")
+
+    def scaled(self, factor: float) -> "SkeletalConfig":
+        """The schedule over so many times the steps."""
+        begin = scaled_count(self.motion_from, factor)
+        return replace(
+            self,
+            correct_from=scaled_count(self.correct_from, factor),
+            motion_from=begin,
+            motion_full=max(scaled_count(self.motion_full, factor), begin + 1),
+            guard_steps=tuple(scaled_count(step, factor) for step in self.guard_steps),
+        )
 
 
 @dataclass(frozen=True)
@@ -136,9 +151,10 @@ def affordable(config: SkeletalConfig) -> SkeletalConfig:
         min_weight=1e-3,
         hidden_dtype="auto",
         volume_every=8,
-        motion_from=300,
-        motion_full=1500,
-        guard_steps=(300, 1000),
+        density_unit=20.0,
+        motion_from=200,
+        motion_full=900,
+        guard_steps=(200, 600),
         guard_frames=4,
         guard_size=64,
     )

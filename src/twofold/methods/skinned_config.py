@@ -14,6 +14,7 @@ from twofold.losses import MAX_STEPS, LossConfig
 from twofold.methods.base import MethodConfig
 from twofold.methods.completion import CompletionConfig
 from twofold.methods.pose_schedule import PoseConfig
+from twofold.recipe import scaled_count
 from twofold.sampling.error_bounded import ErrorBoundedSampler
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.shell_sampler import ShellSampler
@@ -63,6 +64,17 @@ class SkinnedConfig(MethodConfig):
             shell_refresh=(1, MAX_STEPS), outlier_distance=(0.001, 10), beta=(0, 10),
         )  # fmt: skip
         require(0 < self.beta_floor < self.beta, f"beta_floor should lie between 0 and beta={self.beta}")
+
+    def scaled(self, factor: float) -> "SkinnedConfig":
+        """See `MethodConfig.scaled`."""
+        losses = dataclasses.replace(self.losses, lpips_start=scaled_count(self.losses.lpips_start, factor))
+        return dataclasses.replace(
+            self,
+            losses=losses,
+            pose=self.pose.scaled(factor),
+            completion=self.completion.scaled(factor),
+            late_from=scaled_count(self.late_from, factor),
+        )
 
     def completing(self, on: bool) -> "SkinnedConfig":
         """See `MethodConfig.completing`."""

@@ -90,6 +90,46 @@ def learning_rates(recipe: Recipe) -> dict[str, float]:
     return {f"method.rates.{name}": rate for name, rate in to_dict(recipe.method.rates).items()}
 
 
+def with_steps(recipe: Recipe, steps: int) -> Recipe:
+    """The recipe over another number of steps, all stages together, with its whole schedule shortened or stretched.
+
+    >>> npc = with_steps(RECIPES["npc_fast"](), 500)
+    >>> npc.method.first_steps + npc.training.steps
+    500
+    """
+    method = cast(MethodConfig, recipe.method)
+    factor = steps / method.total_steps(recipe.training)
+    scaled = replace(recipe, method=method.scaled(factor), training=recipe.training.scaled(factor))
+    own = scaled.method.total_steps(scaled.training) - scaled.training.steps
+    training = replace(scaled.training, steps=max(steps - own, 1))  # rounding aside
+    return replace(scaled, training=training)
+
+
+def chosen_recipe(
+    name: str, settings: Sequence[str] = (), seed: int = 0, completion: bool | None = None, steps: int | None = None
+) -> Recipe:
+    """A recipe of the table with what a user changes in it.
+
+    Args:
+        name: of `RECIPES`.
+        settings: such as "training.pixels.rays=500"; they hold whatever the other arguments change.
+        seed: of everything random.
+        completion: whether unobserved regions are completed; None as the recipe has it.
+        steps: of the training, with the whole schedule scaled to it; None as the recipe has them.
+
+    Raises:
+        TwofoldError: no such recipe, an unknown setting, a value that does not fit, no completion.
+    """
+    if name not in RECIPES:
+        raise TwofoldError(f"There is no recipe {name!r}; there are {', '.join(RECIPES)}.")
+    recipe = RECIPES[name]()
+    if steps is not None:
+        recipe = with_steps(recipe, steps)
+    if completion is not None:
+        recipe = with_completion(recipe, completion)
+    return with_settings(recipe, [f"seed={seed}", *settings])
+
+
 def with_completion(recipe: Recipe, on: bool) -> Recipe:
     """The recipe with unobserved regions completed, or left as they come.
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from jaxtyping import Float
@@ -32,11 +32,15 @@ from twofold.methods.base import EVALUATION, Batch, Mode, ParameterGroup, Render
 from twofold.methods.skinned import Posed, SkinnedAvatar
 from twofold.methods.skinned_config import SkinnedConfig
 from twofold.methods.subject import Subject
+from twofold.recipe import scaled_count
 from twofold.sampling.placement import Placement
 from twofold.sampling.shell_sampler import ShellPlacer, ShellSampler
 from twofold.volume.nerf_compositing import open_density_weights
 from twofold.volume.rendering import composite
 from twofold.volume.samples import Samples
+
+MAX_PACE = 1000.0
+"""Epochs in one by which the weights of separation move on at most."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ class SeparationConfig:
     def __post_init__(self) -> None:
         """Refuses weights that reward what they should punish."""
         require_within(
-            self, binarisation=(0, 1e6), sparseness=(0, 1e6), in_shape=(0, 1e6), pace=(0, 1000),
+            self, binarisation=(0, 1e6), sparseness=(0, 1e6), in_shape=(0, 1e6), pace=(0, MAX_PACE),
             surface_every=(1, 1_000_000), surface_cells=(16, 1024),
         )  # fmt: skip
 
@@ -67,6 +71,11 @@ class SeparationConfig:
     def needs_surface(self) -> bool:
         """Whether a term looks at the canonical surface."""
         return self.sparseness > 0 or self.in_shape > 0
+
+    def scaled(self, factor: float) -> "SeparationConfig":
+        """The schedule over so many times the steps: the weights end where they did."""
+        every = scaled_count(self.surface_every, factor)
+        return dataclasses.replace(self, pace=min(self.pace / factor, MAX_PACE), surface_every=every)
 
 
 NO_SEPARATION = SeparationConfig(binarisation=0.0, sparseness=0.0, in_shape=0.0)
@@ -114,6 +123,12 @@ class Vid2AvatarConfig(SkinnedConfig):
         whole = isinstance(self.sampler, ShellSampler) or self.sampler.box == "rays"
         require(self.scene is None or whole, "scene needs sampler.box=rays: rays run to the sphere around the scene")
         require(self.losses.mask == 0 or self.scene is None, "losses.mask needs scene=none: masks replace the scene")
+
+    def scaled(self, factor: float) -> "Vid2AvatarConfig":
+        """See `MethodConfig.scaled`."""
+        return cast(
+            Vid2AvatarConfig, dataclasses.replace(super().scaled(factor), separation=self.separation.scaled(factor))
+        )
 
     def build(self, subject: Subject, seed: int = 0) -> "Vid2Avatar":
         """An untrained avatar of a subject."""

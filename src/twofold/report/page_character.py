@@ -71,6 +71,8 @@ def lacking(avatar: Avatar, config: BakeConfig = PAGE) -> str:
 def has_base(avatar: Avatar) -> bool:
     """Whether the field has a base branch, whose colours can be shown by themselves."""
     posed = avatar.pose(torch.zeros(24, 3), torch.zeros(3))
+    if avatar.level_space == "posed":
+        return False
     x, matrix = avatar.to_canonical(posed.body.vertices[:1], posed)
     return avatar.query(x, posed, matrix).base is not None
 

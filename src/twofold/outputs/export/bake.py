@@ -14,7 +14,8 @@ from twofold.errors import TwofoldError
 from twofold.geometry.isosurface import extract_surface, keep_largest
 from twofold.geometry.surfaces import face_areas
 from twofold.methods.base import Avatar, PosedAvatar
-from twofold.outputs.export.morphs import PulledBack, Skin, bounded_weights, fit_morphs, morph_errors, pull_back
+from twofold.outputs.export.density import COLOR_FRAMES, FRAMES, pulled_back, rest_skin, t_pose
+from twofold.outputs.export.morphs import PulledBack, Skin, bounded_weights, fit_morphs, morph_errors
 from twofold.outputs.export.repair import as_tensors, decimate, is_watertight, solid
 from twofold.outputs.export.rig import to_rest, transfer_weights
 
@@ -69,6 +70,9 @@ class Pose:
         return avatar.pose(self.pose, self.translation, self.frame_index)
 
 
+_T_POSE = Pose(torch.zeros(24, 3), torch.zeros(3), None)
+
+
 @dataclass(frozen=True)
 class BakedShape:
     """The surface of a character and how it changes over the training frames.
@@ -98,12 +102,14 @@ class BakedShape:
         """Weights of the targets that bring the mean surface nearest to the avatar's in this pose."""
         if len(self.targets) == 0:
             return self.targets.new_zeros(0)
-        back = pull_back(avatar, posed, self.skin, branch)
+        back = pulled_back(avatar, posed, self.skin, branch)
         return bounded_weights(self.targets, back.displacement[None])[0]
 
 
 def rest_body(avatar: Avatar) -> PosedBody:
     """The avatar's body in the T-pose at the origin."""
+    if avatar.level_space == "posed":
+        return t_pose(avatar)
     return avatar.pose(torch.zeros(24, 3), torch.zeros(3)).body
 
 
@@ -114,7 +120,8 @@ def bake_shape(
     """Surface, skinning and morph targets.
 
     The surface is the mean of the full field over three training frames in canonical space, with as many triangles as
-    asked for; then each vertex takes the mean of the frames' surfaces, pulled back through the skinning.
+    asked for; then each vertex takes the mean of the frames' surfaces, pulled back through the skinning. Of a level in
+    posed space (`outputs.export.density`) it is that of the T-pose, and there are fewer frames and no morph targets.
 
     Args:
         avatar: trained.
@@ -129,27 +136,32 @@ def bake_shape(
         raise TwofoldError("The capture has no training frames, so there is nothing to take the avatar's surface from.")
     rest = rest_body(avatar)
     progress(0.0, "surface")
-    canonical, faces = _extract(avatar, spread(list(frames), 3), rest, config)
-    watertight = is_watertight(canonical.numpy(), faces.numpy())
-    weights = transfer_weights(canonical, faces.numpy(), rest)
-    skin = Skin(to_rest(canonical, weights, rest), canonical, faces, weights, rest)
-    chosen = tuple(spread(list(frames), config.frames))
-    averaged = {id(frame) for frame in spread(chosen, config.color_frames)}
+    in_pose = avatar.level_space == "posed"
+    if in_pose:
+        body = avatar.pose(torch.zeros(24, 3), torch.zeros(3)).body
+        skin = rest_skin(*_extract(avatar, [_T_POSE], body.vertices, body.faces, config), body, rest)
+    else:
+        canonical, faces = _extract(avatar, spread(list(frames), 3), rest.canonical_vertices, rest.faces, config)
+        weights = transfer_weights(canonical, faces.numpy(), rest)
+        skin = Skin(to_rest(canonical, weights, rest), canonical, faces, weights, rest)
+    watertight = is_watertight(skin.canonical.cpu().numpy(), skin.faces.cpu().numpy())
+    chosen = tuple(spread(list(frames), min(config.frames, FRAMES) if in_pose else config.frames))
+    averaged = {id(frame) for frame in spread(chosen, _color_frames(avatar, config))}
     displacements: list[Tensor] = []
     found: list[Tensor] = []
     shown: list[tuple[PosedAvatar, PulledBack]] = []
     for index, frame in enumerate(chosen):
         progress(0.3 + 0.7 * index / len(chosen), "pose-dependent surface")
         posed = frame.of(avatar)
-        back = pull_back(avatar, posed, skin, config.branch)
+        back = pulled_back(avatar, posed, skin, config.branch)
         displacements.append(back.displacement)
         found.append(back.found)
         if id(frame) in averaged:
             shown.append((posed, back))
     off, known = torch.stack(displacements), torch.stack(found)
-    count = config.targets if config.branch == "full" else 0
+    count = config.targets if config.branch == "full" and not in_pose else 0
     morphs = fit_morphs(off, known, count)
-    moved = Skin(skin.vertices + morphs.mean, canonical, faces, weights, rest)
+    moved = replace(skin, vertices=skin.vertices + morphs.mean)
     errors = morph_errors(off, known, count)
     return BakedShape(moved, skin.vertices, morphs.targets, morphs.weights, chosen, errors, watertight, tuple(shown))
 
@@ -159,27 +171,37 @@ def shown_surfaces(avatar: Avatar, shape: BakedShape, config: BakeConfig) -> tup
     if shape.shown:
         return shape.shown
     skin = replace(shape.skin, vertices=shape.extracted)
-    posed = [frame.of(avatar) for frame in spread(shape.frames, config.color_frames)]
-    return tuple((one, pull_back(avatar, one, skin, config.branch)) for one in posed)
+    posed = [frame.of(avatar) for frame in spread(shape.frames, _color_frames(avatar, config))]
+    return tuple((one, pulled_back(avatar, one, skin, config.branch)) for one in posed)
+
+
+def _color_frames(avatar: Avatar, config: BakeConfig) -> int:
+    return min(config.color_frames, COLOR_FRAMES) if avatar.level_space == "posed" else config.color_frames
 
 
 def _extract(
-    avatar: Avatar, frames: list[Pose], rest: PosedBody, config: BakeConfig
+    avatar: Avatar, frames: list[Pose], body: Float[Tensor, "B 3"], triangles: Int[Tensor, "T 3"], config: BakeConfig
 ) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
-    """Canonical surface: the mean level over some frames, near the body, with about as many triangles as asked for."""
-    body = rest.canonical_vertices
+    """The surface where the mean level over some frames is zero, with about as many triangles as asked for.
+
+    Args:
+        avatar: whose level.
+        frames: poses.
+        body: vertices that it is near to, in the space of the level.
+        triangles: of the body.
+        config: see there.
+    """
     posed = [frame.of(avatar) for frame in (frames if config.branch == "full" else frames[:1])]
 
     def level(x: Tensor) -> Tensor:
         return torch.stack([avatar.level(x, one, config.branch) for one in posed]).mean(0)
 
-    area = float(face_areas(body, rest.faces).sum())
+    area = float(face_areas(body, triangles).sum())
     # Marching cubes make some 2.9 triangles per voxel's face of surface; two of three are taken away again, so that the
     # decimation can put the rest where the surface bends.
     voxel = min(max((2.9 * area / (2.7 * config.faces)) ** 0.5, 0.0025), 0.008)
-    vertices, faces = extract_surface(solid(level, body, rest.faces, avatar.reach), body, voxel)
-    points, triangles = decimate(vertices.cpu().numpy(), faces.cpu().numpy(), config.faces)
-    return keep_largest(*as_tensors(points, triangles))
+    vertices, faces = extract_surface(solid(level, body, triangles, avatar.reach), body, voxel)
+    return keep_largest(*as_tensors(*decimate(vertices.cpu().numpy(), faces.cpu().numpy(), config.faces)))
 
 
 @torch.no_grad()

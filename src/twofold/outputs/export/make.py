@@ -27,8 +27,9 @@ from twofold.outputs.export.bake import (
 from twofold.outputs.export.bake_cache import BakeCache, kept
 from twofold.outputs.export.bake_codecs import BakedColors, atlas_codec, paint_codec, shape_codec
 from twofold.outputs.export.character import Character, normals_of
+from twofold.outputs.export.density import RAYS, pulled_back, rendered_colors
 from twofold.outputs.export.lattice import TriangleLattice, build_lattice, segments_for
-from twofold.outputs.export.morphs import PulledBack, pull_back
+from twofold.outputs.export.morphs import PulledBack
 
 QUERIES = 3_000_000
 """Points that the field is queried for the colours of one character, over all poses."""
@@ -189,14 +190,19 @@ def _painted(
     shown: Shown = averaged
     if isinstance(color, int):
         posed = pose_of(capture, frame_at(capture, color)).of(avatar)
-        shown = [(posed, pull_back(avatar, posed, shape.skin, config.branch))]
+        shown = [(posed, pulled_back(avatar, posed, shape.skin, config.branch))]
     vertices, faces = shape.skin.vertices.cpu().numpy(), shape.skin.faces.cpu().numpy()
     # The lattice is as fine for one pose as a texture shows, and coarser where many poses are averaged.
-    segments = segments_for(len(vertices), len(faces), QUERIES // (2 * len(shown))) if atlas else 1
+    in_pose = avatar.level_space == "posed"
+    budget = RAYS if in_pose else QUERIES // 2
+    segments = segments_for(len(vertices), len(faces), budget // len(shown)) if atlas else 1
     lattice = build_lattice(len(vertices), faces, segments)
     branch = "base" if color == "base" or config.branch == "base" else "full"
     lit = config.lit or not avatar.separates_light
-    colors = bake_colors(avatar, shown, lattice.interpolate, branch, lit).cpu().numpy()
+    if in_pose:
+        colors = rendered_colors(avatar, shown, shape.skin.faces, lattice.interpolate).cpu().numpy()
+    else:
+        colors = bake_colors(avatar, shown, lattice.interpolate, branch, lit).cpu().numpy()
     observed = _observed(capture, shape)
     if atlas is None:
         return BakedColors(colors[: len(vertices)], observed, None, None)
@@ -262,7 +268,7 @@ def still(baked: Baked, index: int, turn: Callable[[Tensor], Tensor] = lambda x:
         TwofoldError: there is no such frame.
     """
     posed = pose_of(baked.capture, frame_at(baked.capture, index)).of(baked.avatar)
-    back = pull_back(baked.avatar, posed, baked.shape.skin, baked.config.branch)
+    back = pulled_back(baked.avatar, posed, baked.shape.skin, baked.config.branch)
     vertices = turn(back.posed).cpu().numpy()
     none = baked.character.targets[:0]
     return replace(baked.character, vertices=vertices, targets=none, clips=(), rigged=False)

@@ -71,9 +71,9 @@ def require_exportable(request: ExportRequest, capture: Capture) -> None:
 
 @torch.no_grad()
 def require_surface(avatar: Avatar) -> None:
-    """Refuses methods whose surface cannot be asked for in canonical space, by the sentence of what they lack."""
-    if avatar.level_space != "canonical":
-        raise TwofoldError(f"{type(avatar).__name__} has no surface in canonical space to export; render it instead.")
+    """Refuses methods with a level of canonical space that do not answer for it, by the sentence of what they lack."""
+    if avatar.level_space == "posed":
+        return
     posed = avatar.pose(torch.zeros(24, 3), torch.zeros(3))
     x, matrix = avatar.to_canonical(posed.body.vertices[:1], posed)
     avatar.query(x, posed, matrix)
