@@ -1,6 +1,6 @@
-"""`docs/results.md` and the table of the README, made from the JSON files in `benchmarks/results/`.
+"""`docs/results.md` and the tables of the README and of the methods, from the JSON files in `benchmarks/results/`.
 
-Run `python -m benchmarks.results_page` after a benchmark; a test holds both pages to the stored numbers.
+Run `python -m benchmarks.results_page` after a benchmark; a test holds the pages to the stored numbers.
 """
 
 from __future__ import annotations
@@ -11,12 +11,16 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.methods_section import schedules, side_by_side
 from benchmarks.study_section import answer, section
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, PAGE, README = ROOT / "benchmarks" / "results", ROOT / "docs" / "results.md", ROOT / "README.md"
+METHODS_PAGE = ROOT / "docs" / "methods" / "index.md"
 BEGIN, END = "<!-- results -->\n", "<!-- /results -->\n"
 """The lines of the README between which its table stands."""
+METHODS = {"studio": "On a synthetic subject", "p2s": "On a real video"}
+"""Stored comparisons of methods by name, with headings."""
 
 PICTURES = """## Images of real people
 
@@ -68,6 +72,7 @@ def results_page(results: dict[str, Any]) -> str:
         "sample shaded, float32, gradients by automatic differentiation): same networks, weights and rays. Seconds of "
         "the processor on one thread, measured while other programs ran. `python -m benchmarks.method_steps`.\n\n"
         + _method_steps(results["method-steps-cpu-1threads"]),
+        *_methods(results),
         "## Rendering\n\nSeconds for one image, posing included. `python -m benchmarks.rendering`.\n\n"
         + _rendering(_named(results, "rendering-")),
         "## Quality against time\n\nSynthetic subject, one training camera; PSNR over the subject's box. "
@@ -107,17 +112,33 @@ def readme_table(results: dict[str, Any]) -> str:
 
 def readme_with(text: str, table: str) -> str:
     """The README with `table` between its marks."""
-    before, _, rest = text.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    return f"{before}{BEGIN}{table}{END}{after}"
+    return between(text, BEGIN, table, END)
+
+
+def between(text: str, begin: str, middle: str, end: str) -> str:
+    """The text with `middle` between two of its lines; unchanged where it lacks them."""
+    if begin not in text:
+        return text
+    before, _, rest = text.partition(begin)
+    _, _, after = rest.partition(end)
+    return f"{before}{begin}{middle}{end}{after}"
+
+
+def methods_with(text: str, results: dict[str, Any]) -> str:
+    """The page of the methods with its tables between their marks."""
+    parts = {name: side_by_side(results[f"methods-{name}"], _table) for name in METHODS if f"methods-{name}" in results}
+    for name, part in {**parts, "schedules": schedules(_table)}.items():
+        text = between(text, f"<!-- {name} -->\n", part, f"<!-- /{name} -->\n")
+    return text
 
 
 def main() -> None:
-    """Writes both pages."""
+    """Writes the pages."""
     argparse.ArgumentParser(prog="python -m benchmarks.results_page", description=__doc__).parse_args()
     results = load()
     PAGE.write_text(results_page(results), "utf-8")
     README.write_text(readme_with(README.read_text("utf-8"), readme_table(results)), "utf-8")
+    METHODS_PAGE.write_text(methods_with(METHODS_PAGE.read_text("utf-8"), results), "utf-8")
 
 
 def _named(results: dict[str, Any], prefix: str) -> dict[str, Any]:
@@ -139,6 +160,17 @@ def _studies(results: dict[str, Any]) -> list[str]:
         f"{titles.get(name, f'## Study {name[6:]}')}\n\n{section(study, _table)}"
         for name, study in results.items()
         if name.startswith("study-")
+    ]
+
+
+def _methods(results: dict[str, Any]) -> list[str]:
+    """A section for each stored comparison of methods."""
+    return [
+        f"## Methods side by side: {heading[0].lower()}{heading[1:]}\n\nTrained by their fast recipes for minutes of "
+        "one thread, without LPIPS, while other programs ran; [images](methods/index.md#side-by-side). "
+        "`twofold compare`.\n\n" + side_by_side(results[f"methods-{name}"], _table)
+        for name, heading in METHODS.items()
+        if f"methods-{name}" in results
     ]
 
 

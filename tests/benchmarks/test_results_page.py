@@ -5,7 +5,19 @@ import re
 
 import pytest
 
-from benchmarks.results_page import BEGIN, END, PAGE, README, load, readme_table, readme_with, results_page
+from benchmarks.results_page import (
+    BEGIN,
+    END,
+    METHODS_PAGE,
+    PAGE,
+    README,
+    between,
+    load,
+    methods_with,
+    readme_table,
+    readme_with,
+    results_page,
+)
 
 
 def test_results_page_is_up_to_date() -> None:
@@ -15,6 +27,23 @@ def test_results_page_is_up_to_date() -> None:
 def test_table_of_the_readme_is_up_to_date() -> None:
     text = README.read_text("utf-8")
     assert text == readme_with(text, readme_table(load())), "run python -m benchmarks.results_page"
+
+
+def test_tables_of_the_methods_are_up_to_date() -> None:
+    text = METHODS_PAGE.read_text("utf-8")
+    assert "<!-- schedules -->" in text
+    assert text == methods_with(text, load()), "run python -m benchmarks.results_page"
+
+
+def test_schedules_are_those_of_the_recipes() -> None:
+    text = methods_with("<!-- schedules -->\n<!-- /schedules -->\n", {})
+    assert "| `humannerf_fast` | 400,000 | 1,500 |" in text
+    assert "`motion_from` 200" in text
+    assert "| `npc_fast` | 310,000 | 500 and 1,500 |" in text
+
+
+def test_text_without_marks_stays() -> None:
+    assert between("a\n", "<x>\n", "b\n", "</x>\n") == "a\n"
 
 
 def test_readme_has_at_most_five_rows_of_results() -> None:

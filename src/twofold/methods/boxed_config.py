@@ -98,9 +98,9 @@ def affordable(settings: BoxedSettings, coarse: int = 32, fine: int = 16) -> Box
     return replace(settings, coarse=coarse, fine=fine, max_distance=0.07, hidden_dtype="auto")
 
 
-def short_training(training: TrainingConfig, steps: int = 1500) -> TrainingConfig:
-    """Some ten minutes on two cores: 192 rays of one image a step, a warm-up, rates that fall to a tenth."""
+def short_training(training: TrainingConfig, steps: int = 1500, rays: int = 192) -> TrainingConfig:
+    """Some ten minutes on two cores: a few rays of one image a step, a warm-up, rates that fall early."""
     return replace(
-        training, steps=steps, images_per_step=1, pixels=replace(training.pixels, rays=192), warmup=50, decay=0.1,
-        decay_from=0.3, clip=1.0, checkpoint_every=200,
+        training, steps=steps, images_per_step=1, pixels=replace(training.pixels, rays=rays), warmup=50, decay=0.03,
+        decay_from=0.1, clip=1.0, checkpoint_every=200,
     )  # fmt: skip

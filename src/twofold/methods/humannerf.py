@@ -98,8 +98,8 @@ def humannerf_fast() -> Recipe:
             rays=256, subject_share=0.9, surroundings=8, patches=1, patch_size=16, patch_on_subject=0.8,
             reachable="body", subject="half",
         ),
-        decay=0.1,
-        decay_from=0.3,
+        decay=0.03,
+        decay_from=0.1,
         checkpoint_every=250,
         preview_every=500,
     )  # fmt: skip

@@ -309,7 +309,7 @@ def npc_fast() -> Recipe:
         start.method,
         first=affordable(start.method.first),
         boxed=affordable(start.method.boxed, coarse=40, fine=20),
-        first_steps=500, first_rays=192, first_decay=0.3, point_voxel=0.006, background=0.0, beta=0.02,
+        first_steps=500, first_rays=192, first_decay=0.1, point_voxel=0.006, background=0.0, beta=0.02,
         rates=NpcRates(boxes=1e-3, points=1e-3),
     )  # fmt: skip
     return replace(start, name="npc_fast", method=method, training=short_training(start.training, steps=1500))

@@ -139,7 +139,9 @@ def pm_avatar_fast() -> Recipe:
     start = pm_avatar()
     rates = PmAvatarRates(field=3e-4, radiance=1e-3)
     method = replace(start.method, boxed=affordable(start.method.boxed), rates=rates, min_window=1e-4, misses="empty")
-    return replace(start, name="pm_avatar_fast", method=method, training=short_training(start.training, steps=1200))
+    return replace(
+        start, name="pm_avatar_fast", method=method, training=short_training(start.training, steps=1200, rays=128)
+    )
 
 
 RECIPES: dict[str, Callable[[], Recipe]] = {"pm_avatar": pm_avatar, "pm_avatar_fast": pm_avatar_fast}

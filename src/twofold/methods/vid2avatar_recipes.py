@@ -96,14 +96,12 @@ def _faster(recipe: Recipe) -> Recipe:
         beta=0.02,
         beta_form="softplus",
         scene_scale="metres",
-        rates=replace(start.rates, networks=1e-3),
         prefit=PrefitConfig(steps=400, learning_rate=2e-3, points=384, pool=20_000),
     )
-    # Half the rays and twice the rate: of a given time, a short training makes more with many small steps.
-    pixels = replace(recipe.training.pixels, rays=256, subject="half", replacement=True)
+    pixels = replace(recipe.training.pixels, rays=384, subject="half", replacement=True)
     training = replace(
-        recipe.training, steps=2500, pixels=pixels, milestones=(), warmup=50, decay=0.1, epochs="images",
-        checkpoint_every=250, preview_every=500,
+        recipe.training, steps=1500, pixels=pixels, milestones=(), decay=0.03, decay_from=0.1, epochs="images",
+        checkpoint_every=250,
     )  # fmt: skip
     return replace(recipe, method=method, training=training)
 
