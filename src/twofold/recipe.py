@@ -96,7 +96,7 @@ class TrainingConfig:
             raise ValueError(f"adam_betas={self.adam_betas} should lie in 0..1, below 1")
 
     def scaled(self, factor: float) -> "TrainingConfig":
-        """The same schedule over so many times the steps. Checkpoints and previews come as often as before."""
+        """The same schedule stretched by a factor. Checkpoints and previews come as often as before."""
         return replace(
             self,
             steps=scaled_count(self.steps, factor),

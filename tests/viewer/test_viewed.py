@@ -33,7 +33,7 @@ def test_a_density_without_base_branch_is_viewed_with_the_bare_body_moving(cloud
     assert not viewed.has_base
     meshes = Meshes(viewed)
     meshes.bake()
-    assert "no surface in canonical space" in meshes.note
+    assert "train first" in meshes.note
     assert meshes.of("full")[1]
     now = iter(range(1000))
     eye = Eye(camera_at(viewed, 24, 32))

@@ -67,7 +67,7 @@ class CompletionConfig:
         return self.color > 0 or self.shape > 0
 
     def scaled(self, factor: float) -> "CompletionConfig":
-        """The schedule over so many times the steps."""
+        """The schedule stretched by a factor."""
         return replace(self, start=scaled_count(self.start, factor), every=scaled_count(self.every, factor))
 
 

@@ -47,7 +47,7 @@ class PoseConfig:
         require_within(self, zero_until=steps, zero_epochs=steps, zero_every=steps, drop=(0, 1), refine_from=steps)
 
     def scaled(self, factor: float) -> "PoseConfig":
-        """The schedule over so many times the steps; zero poses later on keep their share of the epochs."""
+        """The schedule stretched by a factor; zero poses later on keep their share of the epochs."""
         return replace(
             self,
             zero_until=scaled_count(self.zero_until, factor),

@@ -69,7 +69,7 @@ class SkeletalConfig:
         require(self.motion_from < self.motion_full, f"motion_from should be below motion_full={self.motion_full}")
 
     def scaled(self, factor: float) -> "SkeletalConfig":
-        """The schedule over so many times the steps."""
+        """The schedule stretched by a factor."""
         begin = scaled_count(self.motion_from, factor)
         return replace(
             self,

@@ -73,7 +73,7 @@ class SeparationConfig:
         return self.sparseness > 0 or self.in_shape > 0
 
     def scaled(self, factor: float) -> "SeparationConfig":
-        """The schedule over so many times the steps: the weights end where they did."""
+        """The schedule stretched by a factor: the weights end where they did."""
         every = scaled_count(self.surface_every, factor)
         return dataclasses.replace(self, pace=min(self.pace / factor, MAX_PACE), surface_every=every)
 

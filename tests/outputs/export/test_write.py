@@ -184,9 +184,3 @@ def test_method_that_cannot_answer_for_its_surface_is_refused(
     with pytest.raises(TwofoldError, match=words):
         export(avatar, person, tmp_path / "exports", ExportRequest(config=SMALL))
     assert not (tmp_path / "exports").exists()
-
-
-def test_method_whose_density_is_no_canonical_one_is_refused(avatar, person, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(type(avatar), "level_space", "posed")
-    with pytest.raises(TwofoldError, match="no surface in canonical space"):
-        export(avatar, person, tmp_path / "exports", ExportRequest(config=SMALL))
