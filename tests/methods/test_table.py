@@ -140,7 +140,7 @@ def test_settings_hold_whatever_the_steps_change():
 def test_steps_are_shown_and_refused_on_the_command_line(tmp_path, capsys):
     main(["train", "--recipe", "npc_fast", "--steps", "500", "--settings"])
     shown = capsys.readouterr().out
-    assert "training.steps=300" in shown.replace(" ", "")
+    assert "training.steps=375" in shown.replace(" ", "")
     assert "steps" in refused(capsys, "train", tmp_path, "--steps", "0")
     assert "--steps" in refused(capsys, "train", "--resume", tmp_path, "--steps", "10")
 
