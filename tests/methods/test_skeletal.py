@@ -188,6 +188,24 @@ def test_samples_that_cannot_be_seen_may_be_left_out_with_the_same_gradients(sub
         assert (gradients[kept] - gradients[0]).norm() < gradient * gradients[0].norm()
 
 
+@pytest.mark.parametrize("changed", [{}, {"min_likelihood": 0.02, "min_weight": 1e-3}])
+def test_density_in_another_unit_is_the_same_avatar(changed, subject, person):
+    """Outputs that are a twentieth, in a unit of twenty a metre: images and level do not change."""
+    plain, other = built(RECIPE, subject, **changed), built(RECIPE, subject, density_unit=20.0, **changed)
+    with torch.no_grad():
+        last = other.canonical.network.layers[-1]
+        last.weight[3] /= 20
+        last.bias[3] /= 20
+        frame = person.train[1]
+        rays = rays_of(frame, 10)
+        one, two = (a.render(rays, a.pose(frame.pose, frame.translation), BACKGROUND) for a in (plain, other))
+        points = plain.pose(frame.pose, frame.translation).body.vertices[::40]
+        levels = [a.level(points, a.pose(frame.pose, frame.translation)) for a in (plain, other)]
+    assert one.opacity.max() > 0.5
+    torch.testing.assert_close(two.color, one.color, rtol=0, atol=1e-5)
+    torch.testing.assert_close(levels[1], levels[0], rtol=0, atol=1e-5)
+
+
 def test_losses_are_means_over_patch_images_and_single_rays(avatar, person):
     pixels = replace(RECIPE.training.pixels, rays=5, patches=2, patch_size=16)
     batch = PixelSource(person.train, person.body, person.betas, pixels).draw(0, torch.Generator().manual_seed(0))
