@@ -7,7 +7,7 @@ import torch
 from tiny_person import person_body
 
 from twofold.body.skeleton import shape_body
-from twofold.field.surface_fill import HEAD, SurfaceFill, body_parts, cotangent_laplacian, weighted_median
+from twofold.field.surface_fill import HEAD, LEGS, TRUNK, SurfaceFill, body_parts, cotangent_laplacian
 from twofold.geometry.surfaces import face_areas, vertex_normals
 
 BODY = person_body()
@@ -27,8 +27,10 @@ def areas():
     return area.numpy()
 
 
-def fill(weight, values):
-    return SurfaceFill(SHAPED, weight.astype(np.float32), areas())(values.astype(np.float32))
+def filled(weight, values):
+    """Completed values at points of the surface, and where these lie."""
+    surface = SurfaceFill(SHAPED, weight.astype(np.float32), areas(), NORMALS[:, 2], 6000)
+    return surface(surface.samples.at(values.astype(np.float32))), surface
 
 
 FRONT = (NORMALS[:, 2] > 0.1).astype(float)
@@ -52,48 +54,54 @@ def test_laplacian_annuls_constants_and_is_that_of_the_energy():
     assert abs(x @ (laplacian @ x) / expected - 1) < 0.25  # marching cubes make needles, whose weights are bounded
 
 
-def test_weighted_median_is_that_of_repeated_rows(generator):
-    values = torch.rand(9, 2, generator=generator).numpy()
-    counts = np.array([1, 2, 1, 3, 1, 1, 2, 1, 1])
-    assert np.allclose(weighted_median(values, counts.astype(float)), np.median(values.repeat(counts, 0), 0))
-
-
 def test_observed_values_stay():
     values = REST @ np.array([[1.0], [0.3], [0.2]], np.float32)
-    found = fill(np.ones(COUNT), values)
-    assert np.abs(found - values).max() < 0.01
+    found, surface = filled(np.ones(COUNT), values)
+    assert np.abs(found - surface.samples.at(values)).max() < 0.01
 
 
 def test_a_constant_stays_a_constant_whatever_was_observed():
-    assert np.abs(fill(FRONT, np.full((COUNT, 2), 0.37)) - 0.37).max() < 1e-3
+    assert np.abs(filled(FRONT, np.full((COUNT, 2), 0.37))[0] - 0.37).max() < 1e-3
 
 
 def test_a_side_that_was_not_seen_mirrors_the_one_that_was():
     left = (REST[:, 0] > MIDDLE + 0.02).astype(float)
     values = np.sin(6 * REST[:, 1:2] + 3 * np.abs(REST[:, :1] - MIDDLE) + 2 * REST[:, 2:])
-    found = fill(left, np.where(left[:, None] > 0, values, 5.0))
-    hidden = REST[:, 0] < MIDDLE - 0.06
-    hairless = hidden & (body_parts(SHAPED).group != HEAD)
-    assert np.abs(found - values)[hairless].mean() < 0.05
+    found, surface = filled(left, np.where(left[:, None] > 0, values, 5.0))
+    hidden = surface.samples.at(REST)[:, 0] < MIDDLE - 0.06
+    hairless = hidden & (surface.group != HEAD)
+    assert np.abs(found - surface.samples.at(values))[hairless].mean() < 0.05
 
 
 def test_the_back_takes_the_colour_of_the_same_height_and_no_small_emblem():
     shirt = (REST[:, 1:2] > -0.2).astype(float)
     emblem = (np.linalg.norm(REST - [MIDDLE, 0.05, 0.11], axis=1) < 0.05)[:, None]
-    found = fill(FRONT, np.where(emblem, 3.0, shirt))
-    back = NORMALS[:, 2] < -0.5
-    trunk = body_parts(SHAPED).group != HEAD
-    far = np.abs(REST[:, 1] + 0.2) > 0.08
-    assert np.abs(found - shirt)[back & trunk & far].max() < 0.3
+    found, surface = filled(FRONT, np.where(emblem, 3.0, shirt))
+    at = surface.samples.at(REST)
+    back = surface.samples.at(NORMALS)[:, 2] < -0.5
+    far = np.abs(at[:, 1] + 0.2) > 0.08
+    expected = (at[:, 1:2] > -0.2).astype(float)
+    assert np.abs(found - expected)[back & (surface.group != HEAD) & far].max() < 0.3
+
+
+def test_stripes_go_on_behind():
+    surface = SurfaceFill(SHAPED, FRONT.astype(np.float32), areas(), NORMALS[:, 2], 20_000)
+    height = surface.samples.at(REST)[:, 1]
+    stripes = (height / 0.05 % 1 < 0.5).astype(float)[:, None]
+    found = surface(np.where(surface.weight[:, None] > 0, stripes, 0.2))
+    back = (surface.samples.at(NORMALS)[:, 2] < -0.3) & (surface.weight == 0) & np.isin(surface.group, (TRUNK, LEGS))
+    assert back.sum() > 500
+    assert np.abs(found - stripes)[back].mean() < 0.12  # 0.5 without stripes
 
 
 def test_the_back_of_the_head_takes_the_hair_and_not_the_face():
     head = body_parts(SHAPED).group == HEAD
     height = (REST[:, 1] - REST[head, 1].min()) / np.ptp(REST[head, 1])
     hair = (height > 0.85).astype(float)[:, None]
-    found = fill(FRONT, hair)
-    behind = head & (NORMALS[:, 2] < -0.6) & (height > 0.5)
+    found, surface = filled(FRONT, hair)
+    height, facing = surface.samples.at(height), surface.samples.at(NORMALS)[:, 2]
+    behind = (surface.group == HEAD) & (facing < -0.6) & (height > 0.5)
     assert behind.any()
     assert found[behind].min() > 0.8
-    face = head & (NORMALS[:, 2] > 0.8) & (height < 0.7)
+    face = (surface.group == HEAD) & (facing > 0.8) & (height < 0.7)
     assert found[face].max() < 0.2

@@ -23,6 +23,8 @@ from twofold.npz import are_moderate
 
 MAX_FRAMES = 100
 """Images that are looked at, evenly spread: a fiftieth of a second each."""
+FACING_FRAMES = 24
+"""Images that `mean_facing` looks at."""
 BUFFER = 384
 """Longer side of the z-buffers, pixels."""
 BEHIND = 0.015
@@ -171,6 +173,24 @@ def measure_coverage(capture: Capture, max_frames: int = MAX_FRAMES) -> Coverage
         best, total = torch.maximum(best, here), total + here
     area = outer_area(body) if body is not None else zeros
     return Coverage(count, cosines, resolutions, combined(best, total), area, len(frames))
+
+
+@torch.no_grad()
+def mean_facing(capture: Capture, max_frames: int = FACING_FRAMES) -> Float[Tensor, "V"]:
+    r"""Mean cosine between each vertex's normal and its direction to the camera over training images, -1..1.
+
+    \[ f_v = E_i \big[ n_{v,i} \cdot (o_i - v_i) / \lVert o_i - v_i \rVert \big] \]
+
+    Near 1 on the front of somebody who always faces the camera, and near 0 everywhere on one who turns.
+    """
+    shaped = shape_body(capture.body, capture.betas)
+    frames = spread(capture.train, max_frames)
+    total = torch.zeros(len(shaped.vertices))
+    for frame in frames:
+        body = pose_body(shaped, frame.pose, frame.translation)
+        towards = torch.nn.functional.normalize(frame.camera.center - body.vertices, dim=-1)
+        total += (vertex_normals(body.vertices, body.faces) * towards).sum(-1)
+    return total / len(frames)
 
 
 def outer_area(body: PosedBody) -> Float[Tensor, "V"]:

@@ -24,15 +24,9 @@ from twofold.field.grids import (
     build_lattices,
     interpolate,
     interpolation_pullback,
-    node_positions,
 )
 from twofold.field.output import FieldOutput
 from twofold.field.small_net import SmallNet
-from twofold.geometry.surfaces import nearest_vertices
-
-UNOBSERVED, OBSERVED = 0.1, 0.5
-"""How well the surface has to be observed for the pose-dependent branch to have any effect, and its whole effect."""
-
 
 DETAILED = ("head", "left_wrist", "right_wrist", "left_hand", "right_hand", "left_foot", "right_foot")
 """Faces, hands and shoes: what neither bends much nor is covered by cloth that folds."""
@@ -278,20 +272,14 @@ class GridField(nn.Module):
 
     def unlit(self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> FieldOutput:
         """What `forward` gives without its law of light: the surface's own colour, up to one factor; no gradients."""
+        fused = self._fused(x, pose)
+        if fused is not None:
+            # The exponential of a law of zeros is one.
+            s, c, _, s1, c1, _ = fused.colors(x, torch.eye(3).expand(len(x), 3, 3), torch.zeros(3, 9))
+            return FieldOutput(s, c, None, FieldOutput(s1, c1, None))
         g = self._geometry(x, pose, "none")
         base, plain = self._unlit_colors(x, g)
         return self._output(FieldOutput(g.s, plain, None), None if base is None else FieldOutput(g.s1, base, None))
-
-    def base_unlit(self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> FieldOutput:
-        """Distance and colour of the branch that is the same in every frame, without light; no gradients by x."""
-        if not self.has_low:
-            return self.unlit(x, pose)
-        code = self.pose_code(pose) if hasattr(self, "pose_code") else None
-        features = self.low_grid(x)
-        answer, _ = self.low_sdf(features, code)
-        color, _ = self.low_color(torch.cat([features, answer[:, 1:]], -1), code)
-        prior = interpolate(self.get_buffer("prior")[:, :1].contiguous(), x, self._prior_lattices)[:, 0]
-        return FieldOutput(prior + 0.1 * answer[:, 0], torch.sigmoid(color[:, :3]), None)
 
     def light_bend(self) -> Float[Tensor, ""]:
         r"""Squared size of the part of the law of light that is quadratic in the normal.
@@ -308,44 +296,15 @@ class GridField(nn.Module):
         return Lattices(*(self.get_buffer(f"prior_{name}") for name in ("rows", "place", "shape")))
 
     def make_observable(self) -> None:
-        """Gives the field a measure of how well it was observed, everywhere for now; part of its state from then on.
-
-        Where nothing was observed the pose-dependent branch has no effect and its features stay zero.
-        """
+        """Gives the field a measure of where the pose-dependent branch has an effect, as stored in earlier versions."""
         self.register_buffer("observed", torch.ones(len(self.get_buffer("prior"))))
         self._take_observed()
-        if self.has_high:
-            self.high_grid.table.register_hook(self._of_observed)
         # A loaded state has a measure of its own.
         self.register_load_state_dict_post_hook(lambda field, _: field._take_observed())
-
-    def observe(self, vertices: Float[Tensor, "V 3"], weight: Float[Tensor, "V"]) -> None:
-        """Takes on how well each vertex of the canonical body was observed, 0..1; needs `make_observable` before."""
-        nodes = node_positions(self._prior_lattices)
-        away, nearest = nearest_vertices(nodes, vertices, min(4, len(vertices)))
-        share = 1 / (away + 1e-3)
-        here = (share * weight.to(away)[nearest]).sum(-1) / share.sum(-1)
-        self.get_buffer("observed").copy_(((here - UNOBSERVED) / (OBSERVED - UNOBSERVED)).clamp(0, 1))
-        self._take_observed()
-        if self.has_high:
-            with torch.no_grad():
-                self.high_grid.table.mul_(self._observed_rows())
 
     def _take_observed(self) -> None:
         prior, observed = self.get_buffer("prior"), self.get_buffer("observed")
         self.register_buffer("prior", torch.stack([prior[:, 0], observed], -1), persistent=False)
-        self._rows: Tensor | None = None
-
-    def _observed_rows(self) -> Tensor:
-        """1 for rows of the fine features that were observed, else 0."""
-        if self._rows is None:
-            nodes = node_positions(self.high_grid.lattices).to(self.high_grid.table)
-            there = interpolate(self.get_buffer("observed")[:, None].contiguous(), nodes, self._prior_lattices)
-            self._rows = (there > 0).to(self.high_grid.table)
-        return self._rows
-
-    def _of_observed(self, gradient: Tensor) -> Tensor:
-        return gradient * self._observed_rows()
 
     def _output(self, whole: FieldOutput, base: FieldOutput | None) -> FieldOutput:
         return replace(whole, base=base) if self.config.branches in ("both", "high_rendered") else whole
@@ -374,6 +333,9 @@ class GridField(nn.Module):
         """
         if to_observation is not None:
             gradient = (to_observation.detach() * gradient[:, None]).sum(-1)
-        normal = F.normalize(gradient, dim=-1)
+        return self.light_on(F.normalize(gradient, dim=-1))
+
+    def light_on(self, normal: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
+        """Brightness of surfaces with these unit normals, observation space."""
         # Polynomials of degree two, as in spherical-harmonics lighting: all that a diffuse surface shows of a scene.
         return torch.exp(self.light(torch.cat([normal, normal * normal, normal * normal.roll(1, -1)], -1)))

@@ -88,26 +88,6 @@ def build_lattices(
     return lattices, np.concatenate(positions).astype(np.float32)
 
 
-def node_positions(lattices: Lattices) -> Float[Tensor, "N 3"]:
-    r"""Where the node of each table row lies, metres; the row of everywhere else lies in a corner of its level.
-
-    \[ x_{ijk} = l + h \, (i, j, k) \qquad \text{with the level's corner } l \text{ and spacing } h \]
-
-    >>> lattices, positions = build_lattices(np.zeros((1, 3), np.float32), (0.1, 0.05), radius=0.02)
-    >>> torch.allclose(node_positions(lattices)[1:5], torch.from_numpy(positions)[1:5])
-    True
-    """
-    found = lattices.place.new_zeros(int(lattices.rows.max()) + 1, 3)
-    for (*low, inverse), (nx, ny, nz, begin) in zip(lattices.place, lattices.shape.tolist(), strict=True):
-        axes = [torch.arange(n, device=found.device) for n in (nx, ny, nz)]
-        nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        rows = lattices.rows[begin : begin + len(nodes)].long()
-        kept = rows > rows.min()
-        found[rows[kept]] = torch.stack(low) + nodes[kept] / inverse
-        found[rows.min()] = torch.stack(low)
-    return found
-
-
 def corners(x: Float[Tensor, "S 3"], lattices: Lattices, level: int) -> tuple[Int[Tensor, "S 8"], Float[Tensor, "S 3"]]:
     r"""Table rows of the eight nodes around each point, and its position in the cell (0..1), in PyTorch.
 

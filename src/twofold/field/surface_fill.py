@@ -1,8 +1,8 @@
 """Values over the surface of a body, completed from where they were observed.
 
-What was never filmed is taken from the mirrored point where that was seen, else from the same body part at the same
-height; the back of the head takes the colour of the hair. A screened Poisson equation joins all this to what was
-observed without a seam.
+A first guess for what was never filmed is the same body part at the same height; on the back of the head it is the
+hair. What the observed part differs from that guess is carried over the border and to the mirrored side by a screened
+Poisson equation, so there is no seam.
 """
 
 from dataclasses import dataclass
@@ -14,18 +14,26 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from twofold.body.skeleton import ShapedBody
-from twofold.geometry.surfaces import vertex_normals
+from twofold.field.surface_samples import even_samples, ring_medians, slope_within, weighted_median
 from twofold.kernels.kdtree import search_tree
 
 GROUPS = (0, 1, 1, 0, 1, 1, 0, 1, 1, 0, 2, 2, 3, 0, 0, 4, 5, 5, 5, 5, 5, 5, 6, 6)
 """Body part of each joint, left and right alike: trunk, legs, feet, neck, head, arms, hands."""
 TRUNK, LEGS, FEET, NECK, HEAD, ARMS, HANDS = range(7)
-BIN = 0.02
+SAMPLES = 40_000
+"""Points on the surface, some 7 mm apart: fine enough for stripes, which the vertices of a body are not."""
+RING = 0.006
 """Height of a ring around a body part, metres."""
-OBSERVED_LENGTH, MIRROR_LENGTH, HAIR_LENGTH, RING_LENGTH = 0.012, 0.02, 0.025, 0.08
+ENOUGH = 2e-5
+"""Observed area without which a ring takes its value from those beside, square metres."""
+OBSERVED_LENGTH, MIRROR_LENGTH, HAIR_LENGTH, RING_LENGTH = 0.012, 0.02, 0.025, 0.04
 """Metres over which the solution leaves an observed value, a mirrored one, the hair's and a ring's for those beside."""
 FREE_LENGTH = 10.0
 """The same where nothing is to be said: what is beside decides."""
+SIDEWAYS = 0.1
+"""How much a point of a ring that faces the cameras counts; one that is seen from its side counts 1 + this."""
+SLOPE_RING = 0.03
+"""Height of the rings in which `SurfaceFill.slope` compares, metres."""
 SCALP, NAPE = 0.82, 0.12
 """Heights within the head, 0 at the chin and 1 at the crown: hair for certain above the first; behind the ears down to
 the second."""
@@ -37,12 +45,10 @@ class BodyParts:
 
     Attributes:
         group: body part, see `GROUPS`.
-        along: place along the part, metres: height, and distance from the middle of the body on arms and hands.
         mirrored: the vertex nearest to the mirrored place.
     """
 
     group: Int[np.ndarray, "V"]
-    along: Float[np.ndarray, "V"]
     mirrored: Int[np.ndarray, "V"]
 
 
@@ -61,12 +67,10 @@ def body_parts(shaped: ShapedBody) -> BodyParts:
     """
     rest = shaped.vertices.numpy()
     group = np.array(GROUPS)[shaped.weights.numpy().argmax(1)]
-    level = np.isin(group, (ARMS, HANDS))
     middle = shaped.joints[0].numpy()
-    along = np.where(level, np.abs(rest[:, 0] - middle[0]), rest[:, 1])
     flipped = rest * np.array([-1, 1, 1], rest.dtype) + np.array([2 * middle[0], 0, 0], rest.dtype)
     mirrored = np.asarray(search_tree(rest).query(flipped)[1], dtype=np.int64)
-    return BodyParts(group, along, mirrored)
+    return BodyParts(group, mirrored)
 
 
 def cotangent_laplacian(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> sparse.csc_matrix:
@@ -93,73 +97,87 @@ def cotangent_laplacian(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarra
     return cast(sparse.csc_matrix, sparse.diags(np.asarray(edges.sum(1)).ravel()).tocsc() - edges)
 
 
-def weighted_median(values: Float[np.ndarray, "n C"], weight: Float[np.ndarray, "n"]) -> Float[np.ndarray, "C"]:
-    r"""The median of each column, each row counted by its weight.
-
-    \[ \min \{ v_k : \sum_{v_i \le v_k} w_i \ge \tfrac12 \sum_i w_i \} \]
-
-    >>> weighted_median(np.array([[1.0], [2.0], [9.0]]), np.array([1.0, 1.0, 3.0]))
-    array([9.])
-    """
-    order = values.argsort(0)
-    ends = weight[order].cumsum(0)
-    which = (ends < 0.5 * ends[-1]).sum(0).clip(0, len(values) - 1)
-    columns = np.arange(values.shape[1])
-    return values[order[which, columns], columns]
-
-
 class SurfaceFill:
-    """Completes values that were observed on part of a body's surface."""
+    """Completes values that were observed on part of a body's surface, at points spread evenly over it."""
 
-    def __init__(self, shaped: ShapedBody, weight: Float[np.ndarray, "V"], area: Float[np.ndarray, "V"]) -> None:
+    def __init__(
+        self, shaped: ShapedBody, weight: Float[np.ndarray, "V"], area: Float[np.ndarray, "V"],
+        facing: Float[np.ndarray, "V"], count: int = SAMPLES,
+    ) -> None:  # fmt: skip
         """Prepares everything that does not depend on the values.
 
         Args:
             shaped: the body in the T-pose.
             weight: how well each vertex was observed, 0..1.
             area: of the surface around each vertex, square metres; 0 for inner parts.
+            facing: mean cosine of the angle between each vertex's normal and the direction to the cameras.
+            count: of the points.
         """
         self.parts = body_parts(shaped)
         self.rest = shaped.vertices.double().numpy()
-        self.normals = vertex_normals(shaped.vertices, shaped.faces).numpy()
-        self.joints = shaped.joints.double().numpy()
-        self.weight = weight.astype(np.float64)
-        self.area = area.astype(np.float64)
-        self.mirror_weight = self.weight[self.parts.mirrored]
-        self.hairy = self._hairiness()
-        laplacian = cotangent_laplacian(self.rest, shaped.faces.numpy())
+        faces = shaped.faces.numpy()
+        outer = (area > 0).astype(float)
+        self.samples = even_samples(self.rest, faces, outer[faces].mean(1), count)
+        self.weight = self.samples.at(weight.astype(np.float64))
+        self.group = self.parts.group[self.samples.nearest]
+        self.along = _along(self.samples.at(self.rest), self.group, float(shaped.joints[0, 0]))
+        self.hairy, self.crown = (self.samples.at(values) for values in self._hair_regions())
+        self._head_height = self.samples.at(self._head_heights()[0])
+        self._trust = self.weight * self.samples.area
+        self.facing = self.samples.at(facing.astype(np.float64))
+        # What lies beside the unobserved part says more about it than what is on the chest.
+        self._beside = self._trust * (1 + SIDEWAYS - self.facing).clip(SIDEWAYS)
+        self._mirrored = self._mirrors(float(shaped.joints[0, 0]))
+        self._seen_there = (1 - self.weight) * self.weight[self._mirrored]
+        self._gather = self.samples.gather(len(self.rest)) @ sparse.diags(self._trust)
+        self._gathered = np.asarray(self._gather.sum(1)).ravel()
+        laplacian = cotangent_laplacian(self.rest, faces)
         # Inner parts have no outer area, but have to hang together with the rest.
-        mass = self.area + 0.1 * self.area[self.area > 0].mean()
-        unseen = 1 - self.weight
-        mirrored = unseen * self.mirror_weight / MIRROR_LENGTH**2
-        hair = unseen * self.hairy / HAIR_LENGTH**2
+        mass = area + 0.1 * area[area > 0].mean()
+        observed = np.where(self._gathered > 0, weight.astype(np.float64), 0)
+        unseen = 1 - observed
         head = self.parts.group == HEAD
-        ring = unseen * np.where(head, 1e-3, 1.0) / RING_LENGTH**2
-        self._pulls = [mass * pull for pull in (self.weight**2 / OBSERVED_LENGTH**2, mirrored, hair, ring)]
-        self._free = mass / FREE_LENGTH**2
-        diagonal = sum(self._pulls) + self._free
+        ring = np.where(head, 1e-3, 1.0) / RING_LENGTH**2 + self._hair_regions()[0] / HAIR_LENGTH**2
+        mirrored = observed[self.parts.mirrored] / MIRROR_LENGTH**2
+        self._observed = mass * observed**2 / OBSERVED_LENGTH**2
+        diagonal = self._observed + mass * (unseen * (ring + mirrored) + 1 / FREE_LENGTH**2)
         self._solver: SuperLU = splu((laplacian + sparse.diags(diagonal)).tocsc())
 
-    def __call__(self, values: Float[np.ndarray, "V C"]) -> Float[np.ndarray, "V C"]:
-        r"""The completed values: nearly the observed ones where these are good.
+    def __call__(self, values: Float[np.ndarray, "n C"], ring: float = RING) -> Float[np.ndarray, "n C"]:
+        r"""The completed values at the samples: by their weight the observed ones, for the rest what was completed.
 
-        The minimum over $u$ of
+        That is $g + u$ with the guess $g$ from rings and hair and the $u$ that minimises
 
         \[ \int \lVert \nabla u \rVert^2 + \sum_k \int \frac{w_k}{\ell_k^2} \lVert u - p_k \rVert^2 \]
 
-        with what was observed, its mirror image, the hair and the rings as $p_k$.
+        where $p_1$ is what was observed less the guess, and the others are zero: where the mirrored point was seen,
+        on hair, and by the length over which a ring lets go of what is beside.
 
         Args:
-            values: as observed; where the weight is 0 they do not matter.
+            values: as observed, at the samples; where the weight is 0 they do not matter.
+            ring: height of a ring, metres.
         """
         values = np.where(self.weight[:, None] > 0, values, 0).astype(np.float64)
-        trust = self.weight * (self.area + 1e-9)
-        everywhere = weighted_median(values, trust)
-        pieces = (values, values[self.parts.mirrored], self._hair(values, trust)[None], self._rings(values, trust))
-        right = self._free[:, None] * everywhere
-        for pull, piece in zip(self._pulls, pieces, strict=True):
-            right = right + pull[:, None] * piece
-        return self._solver.solve(right).astype(np.float32)
+        guess = self.guess(values, ring)
+        rest = (self._gather @ (values - guess)) / self._gathered.clip(1e-12)[:, None]
+        completed = guess + self.samples.at(self._solver.solve(self._observed[:, None] * rest))
+        return (completed + self.weight[:, None] * (values - completed)).astype(np.float32)
+
+    def guess(self, values: Float[np.ndarray, "n C"], ring: float = RING) -> Float[np.ndarray, "n C"]:
+        """Each sample's mirror image by how well it was seen; for the rest its ring (`ring_medians`), or the hair."""
+        around = ring_medians(values, self._beside, self.group, self.along, ring, ENOUGH)
+        alone = around + self.hairy[:, None] * (self._hair(values) - around)
+        return alone + self._seen_there[:, None] * (values[self._mirrored] - alone)
+
+    def _mirrors(self, middle: float) -> Int[np.ndarray, "n"]:
+        """The sample nearest to the mirror image of each."""
+        places = self.samples.at(self.rest)
+        return np.asarray(search_tree(places).query(places * [-1, 1, 1] + [2 * middle, 0, 0])[1], dtype=np.int64)
+
+    def slope(self, values: Float[np.ndarray, "n"]) -> float:
+        """How observed values grow with the cosine to the cameras within rings; see `slope_within`."""
+        off_head = self._trust * (self.group != HEAD)
+        return slope_within(values, self.facing, off_head, self.group, self.along, SLOPE_RING)
 
     def _head_heights(self) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
         """Height of each vertex within the head (0 at the chin, 1 at the crown), and how far behind its middle, metres.
@@ -174,47 +192,28 @@ class SurfaceFill:
         height = (self.rest[:, 1] - low) / max(high - low, 1e-6)
         return height, 0.5 * (front.min() + front.max()) - self.rest[:, 2]
 
-    def _hairiness(self) -> Float[np.ndarray, "V"]:
-        """1 where hair grows on nearly everybody: the crown, and the head behind the ears down to the nape."""
+    def _hair_regions(self) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
+        """1 where hair grows on nearly everybody (crown, and behind the ears down to the nape), and 1 on the crown."""
         height, behind = self._head_heights()
+        head = self.parts.group == HEAD
+        crown = np.where(head, np.clip((height - SCALP) / 0.05, 0, 1), 0.0)
         back = np.clip((behind + 0.01) / 0.02, 0, 1) * np.clip((height - NAPE) / 0.1, 0, 1)
-        return np.where(self.parts.group == HEAD, np.maximum(back, self._crown()), 0.0)
+        return np.where(head, np.maximum(back, crown), 0.0), crown
 
-    def _crown(self) -> Float[np.ndarray, "V"]:
-        """1 on the top of the head, 0 below."""
-        return np.where(self.parts.group == HEAD, np.clip((self._head_heights()[0] - SCALP) / 0.05, 0, 1), 0.0)
-
-    def _hair(self, values: Float[np.ndarray, "V C"], trust: Float[np.ndarray, "V"]) -> Float[np.ndarray, "C"]:
+    def _hair(self, values: Float[np.ndarray, "n C"]) -> Float[np.ndarray, "C"]:
         """What was observed of the crown, or else of the highest part of the head that was.
 
         Not of all that is hairy: a camera in front sees ears and cheeks beside it.
         """
-        height, _ = self._head_heights()
-        counted = trust * self._crown()
+        counted = self._trust * self.crown
         if counted.sum() < 1e-4:  # less than a square centimetre
-            seen = (self.parts.group == HEAD) & (self.weight > 0)
+            seen = (self.group == HEAD) & (self.weight > 0)
             if not seen.any():
-                return weighted_median(values, trust)
-            counted = trust * (seen & (height >= np.quantile(height[seen], 0.9)))
+                return weighted_median(values, self._trust)
+            counted = self._trust * (seen & (self._head_height >= np.quantile(self._head_height[seen], 0.9)))
         return weighted_median(values, counted)
 
-    def _rings(self, values: Float[np.ndarray, "V C"], trust: Float[np.ndarray, "V"]) -> Float[np.ndarray, "V C"]:
-        """The median of what was observed of the same body part at the same height, on either side of the body."""
-        group, along = self.parts.group, self.parts.along
-        out = np.broadcast_to(weighted_median(values, trust), values.shape).copy()
-        for part in range(max(GROUPS) + 1):
-            own = np.nonzero(group == part)[0]
-            seen = own[trust[own] > 1e-9]
-            if not len(seen):
-                continue
-            index = np.floor(along[seen] / BIN).astype(int)
-            places, medians = [], []
-            for ring in range(int(index.min()), int(index.max()) + 1):
-                near = seen[np.abs(index - ring) <= 1]
-                if trust[near].sum() > 2e-5:
-                    places.append((ring + 0.5) * BIN)
-                    medians.append(weighted_median(values[near], trust[near]))
-            if places:
-                table = np.array(medians)
-                out[own] = np.stack([np.interp(along[own], places, column) for column in table.T], -1)
-        return out
+
+def _along(points: Float[np.ndarray, "n 3"], group: Int[np.ndarray, "n"], middle: float) -> Float[np.ndarray, "n"]:
+    """Height, and distance from the middle of the body on arms and hands, metres."""
+    return np.where(np.isin(group, (ARMS, HANDS)), np.abs(points[:, 0] - middle), points[:, 1])

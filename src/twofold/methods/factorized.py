@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from twofold.capture.types import Capture
 from twofold.config import require
 from twofold.field.factorized import FactorizedField, FactorizedFieldConfig
 from twofold.field.factorized_grid import GridField, GridFieldConfig
 from twofold.field.output import FieldOutput
+from twofold.geometry.surfaces import vertex_normals
 from twofold.kernels.runtime import compiled_methods
 from twofold.methods.base import Batch, Mode, ParameterGroup, Rendering
 from twofold.methods.factorized_config import RateConfig
@@ -50,14 +50,12 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
     def __init__(self, config: FactorizedConfig, subject: Subject, seed: int) -> None:
         """Builds the field around the subject's canonical body."""
         super().__init__(config, subject, seed, config.field.build)
-        if self.completion is not None and isinstance(self.field, GridField):
-            self.field.make_observable()
 
-    def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
-        """See `Avatar.prepare_training`; feature grids switch their residual off where nothing was observed."""
-        super().prepare_training(capture, stage, generator)
-        if self.completion is not None and isinstance(self.field, GridField):
-            self.field.observe(self.canonical_points, self.completion.weight)
+    def load_stored(self, state: dict[str, Tensor]) -> None:
+        """See `Avatar.load_stored`: runs of an earlier version switch the residual off where nothing was observed."""
+        super().load_stored(state)
+        if "field.observed" in state and isinstance(self.field, GridField):
+            self.field.make_observable()
 
     def answer_beside(self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed) -> FieldOutput:
         """See `SkinnedAvatar.answer_beside`; of feature grids it is without light."""
@@ -65,13 +63,11 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
             return self.field.unlit(x_canonical, posed.own.condition)
         return super().answer_beside(x_canonical, vertex, posed)
 
-    def completed_beside(
-        self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed
-    ) -> tuple[FieldOutput, ...]:
-        """See `SkinnedAvatar.completed_beside`; of feature grids it is the base branch, as nothing else is there."""
+    def light_beside(self, vertex: Int[Tensor, "S"], posed: Posed) -> Float[Tensor, "S 3"]:
+        """See `SkinnedAvatar.light_beside`."""
         if isinstance(self.field, GridField):
-            return (self.field.base_unlit(x_canonical, posed.own.condition),)
-        return super().completed_beside(x_canonical, vertex, posed)
+            return self.field.light_on(vertex_normals(posed.body.vertices, posed.body.faces)[vertex])
+        return super().light_beside(vertex, posed)
 
     def losses(
         self, rendering: Rendering, batch: Batch, posed: Posed, mode: Mode, generator: torch.Generator

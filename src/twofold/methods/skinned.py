@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from twofold.body.skeleton import PosedBody, ShapedBody, movements, pose_body, shape_body
-from twofold.capture.coverage import coverage_of
+from twofold.capture.coverage import coverage_of, mean_facing
 from twofold.capture.types import Capture
 from twofold.config import require
 from twofold.deform.pose_refinement import PoseRefinement
@@ -102,19 +102,21 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
     def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
         """See `Avatar.prepare_training`: how well the surface was observed, where it is to be completed."""
         if self.completion is not None:
-            self.completion.prepare(coverage_of(capture))
+            self.completion.prepare(coverage_of(capture), mean_facing(capture))
+
+    def load_stored(self, state: dict[str, Tensor]) -> None:
+        """See `Avatar.load_stored`."""
+        if self.completion is not None:
+            self.completion.take_on(state, "completion.")
 
     def answer_beside(self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed) -> FieldOutput:
-        """What completion takes its targets from, at canonical points beside these vertices."""
-        turned = normal_matrices(vertex[:, None], torch.ones_like(x_canonical[:, :1]), posed.own.surface.forward)
-        return self.field(x_canonical, posed.own.condition, turned)
+        """What completion takes its targets from and pulls to them, at canonical points beside these vertices."""
+        turn = normal_matrices(vertex[:, None], torch.ones_like(x_canonical[:, :1]), posed.own.surface.forward)
+        return self.field(x_canonical, posed.own.condition, turn)
 
-    def completed_beside(
-        self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed
-    ) -> tuple[FieldOutput, ...]:
-        """The branches that completion pulls to these targets."""
-        answer = self.answer_beside(x_canonical, vertex, posed)
-        return (answer,) if answer.base is None else (answer, answer.base)
+    def light_beside(self, vertex: Int[Tensor, "S"], posed: Posed) -> Float[Tensor, "S 3"]:
+        """The light that the colours of `answer_beside` lack."""
+        return torch.ones(len(vertex), 3, device=vertex.device)
 
     @property
     def wants_perceptual(self) -> bool:
@@ -157,19 +159,18 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         if self.refinement.parts and step and step % refresh == 0 and step >= self.config.pose.refine_from:
             with torch.no_grad():
                 self._follow(*self._refined())
-        if self.completion is not None and self.completion.is_due(step):
+        if (own := self.completion) is not None and own.is_due(step):
             # In the first frame's pose, whatever this step shows: so any number of processes find the same.
             subject = self.subject
             posed = self.pose(subject.poses[0], subject.translations[0], int(subject.times[0]), mode)
-            self.completion.refresh(lambda x, vertex: self.answer_beside(x, vertex, posed))
+            own.refresh(lambda x, v: self.answer_beside(x, v, posed), self.light_beside(own.beside, posed))
 
     def _refined(self) -> tuple[Tensor, Tensor]:
         """Poses and translations of all training frames with their corrections."""
+        subject = self.subject
         found = [
             self.refinement(int(time), pose.to(self.device), translation.to(self.device))
-            for time, pose, translation in zip(
-                self.subject.times, self.subject.poses, self.subject.translations, strict=True
-            )
+            for time, pose, translation in zip(subject.times, subject.poses, subject.translations, strict=True)
         ]
         return torch.stack([pose for pose, _ in found]), torch.stack([translation for _, translation in found])
 
@@ -342,7 +343,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         config, vertices, step = self.config.losses, self.canonical_points, mode.step or 0
         terms = loss_terms(config, rendering, batch, vertices, gradients, network, step, generator)
         if self.completion is not None:
-            terms |= self.completion.terms(lambda x, v: self.completed_beside(x, v, posed), step, generator)
+            terms |= self.completion.terms(lambda x, v: self.answer_beside(x, v, posed), step, generator)
         return terms
 
     def level(self, x: Float[Tensor, "S 3"], posed: Posed, branch: str = "full") -> Float[Tensor, "S"]:
@@ -357,9 +358,8 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
     ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
         """See `Avatar.refined_pose`."""
         with torch.no_grad():
-            return self.refinement.at(
-                frame_index, pose.to(self.device), translation.to(self.device), self.subject, max_gap
-            )
+            given = pose.to(self.device), translation.to(self.device)
+            return self.refinement.at(frame_index, *given, self.subject, max_gap)
 
     def pose_corrections(self) -> dict[str, float]:
         """See `Avatar.pose_corrections`."""

@@ -207,6 +207,7 @@ class Vid2Avatar(SkinnedAvatar[Vid2AvatarConfig, ImplicitField]):
         Raises:
             TwofoldError: its triangles name vertices that it does not have.
         """
+        super().load_stored(state)
         vertices, faces = state.get("surface_vertices"), state.get("surface_faces")
         if vertices is None or faces is None or not self.config.separation.needs_surface:
             return
