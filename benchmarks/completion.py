@@ -43,7 +43,7 @@ def recipe(steps: int, on: bool) -> Recipe:
     """`quick` without pose refinement, as the poses are exact."""
     start = quick()
     method = replace(start.method, pose=replace(start.method.pose, refine=()))
-    training = replace(start.training, steps=steps, preview_every=0)
+    training = replace(start.training, steps=steps, preview_every=0, checkpoint_every=100_000)
     return with_completion(replace(start, method=method, training=training), on)
 
 
@@ -78,23 +78,19 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     tune_process()
-    rows: list[dict[str, object]] = []
     for seed in arguments.seeds:
         folder = arguments.work / f"subject{seed}"
         if not folder.exists():
-            config = StudioConfig(seed, arguments.size, FRAMES, CAMERAS, yaw_range=YAW)
-            make_studio(config, folder)
-        capture = read_capture(folder)
-        look = sample_look(seed)
+            make_studio(StudioConfig(seed, arguments.size, FRAMES, CAMERAS, yaw_range=YAW), folder)
+        capture, look = read_capture(folder), sample_look(seed)
         row: dict[str, object] = {"seed": seed, "shirt": look.shirt, "hair": look.hair}
-        row["surface"] = coverage_of(capture).share
-        for on in (False, True):
-            run = arguments.work / f"subject{seed}-{'on' if on else 'off'}"
-            avatar = trained(capture, run, arguments.steps, on)
+        row |= {"steps": arguments.steps, "size": arguments.size, "surface": coverage_of(capture).share}
+        for name in ("off", "on"):
+            run = arguments.work / f"subject{seed}-{name}"
+            avatar = trained(capture, run, arguments.steps, name == "on")
             spent = read_spent(run / CHECKPOINT)
-            row["on" if on else "off"] = {**measured(avatar, capture), "processor_s": spent and spent.processor}
-        rows.append(row)
-    store("completion", {"what": PROTOCOL, "steps": arguments.steps, "size": arguments.size, "subjects": rows})
+            row[name] = {**measured(avatar, capture), "processor_s": spent and spent.processor}
+        store(f"completion-seed{seed}", {"what": PROTOCOL, **row})
 
 
 if __name__ == "__main__":

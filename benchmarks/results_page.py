@@ -77,6 +77,7 @@ def results_page(results: dict[str, Any]) -> str:
         + _rendering(_named(results, "rendering-")),
         "## Quality against time\n\nSynthetic subject, one training camera; PSNR over the subject's box. "
         "`python -m benchmarks.quality`.\n\n" + _quality(_named(results, "quality-")),
+        *_completions(_named(results, "completion-", "")),
         PICTURES,
     ]
     return "\n".join(part.rstrip() + "\n" for part in parts)
@@ -141,8 +142,8 @@ def main() -> None:
     METHODS_PAGE.write_text(methods_with(METHODS_PAGE.read_text("utf-8"), results), "utf-8")
 
 
-def _named(results: dict[str, Any], prefix: str) -> dict[str, Any]:
-    return {name: result for name, result in results.items() if name.startswith(prefix) and "cpu" in name}
+def _named(results: dict[str, Any], prefix: str, part: str = "cpu") -> dict[str, Any]:
+    return {name: result for name, result in results.items() if name.startswith(prefix) and part in name}
 
 
 def _benchmarks(results: dict[str, Any]) -> list[dict[str, Any]]:
@@ -232,6 +233,32 @@ def _quality(results: dict[str, Any]) -> str:
         for result in results.values() for point in result["curve"]
     ]  # fmt: skip
     return _table(("Threads", "Seed", "Step", "Training time", "Novel views", "Novel poses"), rows)
+
+
+def _completions(results: dict[str, Any]) -> list[str]:
+    """A section on unobserved regions, where it was measured."""
+    rows: list[tuple[str, ...]] = []
+    for result in results.values():
+        off, on = result["off"], result["on"]
+
+        def pair(name: str, digits: int, off: dict[str, Any] = off, on: dict[str, Any] = on) -> str:
+            return f"{off[name]:.{digits}f} / {on[name]:.{digits}f}"
+
+        rows.append(
+            (
+                f"seed {result['seed']} ({result['shirt']}, {result['hair']})", str(result["steps"]),
+                f"{100 * result['surface']:.0f} %", pair("unobserved_error", 3), pair("observed_error", 3),
+                f"{pair('front_psnr', 2)} dB",
+            )
+        )  # fmt: skip
+    head = ("Subject", "Steps", "Surface observed", "Unobserved pixels", "Observed pixels", "Training images")
+    text = (
+        "## Unobserved regions\n\nSynthetic subjects filmed from the front only (within 30 degrees to either side), "
+        "without / with [completion](completion.md): mean absolute colour errors (0 to 1) of the pixels of novel views "
+        "that show what no training image shows, and of those that show what one does; PSNR over the person in "
+        "training images. `python -m benchmarks.completion`.\n\n"
+    )
+    return [text + _table(head, rows)] if rows else []
 
 
 def _ratio(result: dict[str, Any]) -> float:

@@ -94,6 +94,17 @@ def test_stripes_go_on_behind():
     assert np.abs(found - stripes)[back].mean() < 0.12  # 0.5 without stripes
 
 
+def test_an_open_collar_does_not_go_around_the_neck():
+    neck = float(SHAPED.joints[12, 1])
+    surface = SurfaceFill(SHAPED, FRONT.astype(np.float32), areas(), NORMALS[:, 2], 20_000)
+    at = surface.samples.at(REST)
+    skin = ((at[:, 1] > neck - 0.09) & (surface.group == TRUNK)).astype(float)[:, None]
+    back = (surface.samples.at(NORMALS)[:, 2] < -0.5) & (skin[:, 0] == 1)
+    assert back.sum() > 100
+    found = surface(skin)[back]
+    assert np.median(found) < 0.1
+
+
 def test_the_back_of_the_head_takes_the_hair_and_not_the_face():
     head = body_parts(SHAPED).group == HEAD
     height = (REST[:, 1] - REST[head, 1].min()) / np.ptp(REST[head, 1])

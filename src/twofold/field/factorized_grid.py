@@ -281,6 +281,17 @@ class GridField(nn.Module):
         base, plain = self._unlit_colors(x, g)
         return self._output(FieldOutput(g.s, plain, None), None if base is None else FieldOutput(g.s1, base, None))
 
+    def unlit_features(self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> FieldOutput:
+        """`unlit` of which only the features in the grids learn, and the networks do not."""
+        networks = [p for name, p in self.named_parameters() if "grid" not in name and p.requires_grad]
+        for parameter in networks:
+            parameter.requires_grad_(False)
+        try:
+            return self.unlit(x, pose)
+        finally:
+            for parameter in networks:
+                parameter.requires_grad_(True)
+
     def light_bend(self) -> Float[Tensor, ""]:
         r"""Squared size of the part of the law of light that is quadratic in the normal.
 

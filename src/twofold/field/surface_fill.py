@@ -34,6 +34,8 @@ SIDEWAYS = 0.1
 """How much a point of a ring that faces the cameras counts; one that is seen from its side counts 1 + this."""
 SLOPE_RING = 0.03
 """Height of the rings in which `SurfaceFill.slope` compares, metres."""
+NECKLINE = 0.11
+"""How far below the neck joint clothes may be open in front, metres: rings above are those as far below that height."""
 SCALP, NAPE = 0.82, 0.12
 """Heights within the head, 0 at the chin and 1 at the crown: hair for certain above the first; behind the ears down to
 the second."""
@@ -121,6 +123,9 @@ class SurfaceFill:
         self.weight = self.samples.at(weight.astype(np.float64))
         self.group = self.parts.group[self.samples.nearest]
         self.along = _along(self.samples.at(self.rest), self.group, float(shaped.joints[0, 0]))
+        neckline = float(shaped.joints[12, 1]) - NECKLINE
+        behind = (self.group == TRUNK) & (self.along > neckline)
+        self._ring_at = np.where(behind, 2 * neckline - self.along, self.along)
         self.hairy, self.crown = (self.samples.at(values) for values in self._hair_regions())
         self._head_height = self.samples.at(self._head_heights()[0])
         self._trust = self.weight * self.samples.area
@@ -165,7 +170,7 @@ class SurfaceFill:
 
     def guess(self, values: Float[np.ndarray, "n C"], ring: float = RING) -> Float[np.ndarray, "n C"]:
         """Each sample's mirror image by how well it was seen; for the rest its ring (`ring_medians`), or the hair."""
-        around = ring_medians(values, self._beside, self.group, self.along, ring, ENOUGH)
+        around = ring_medians(values, self._beside, self.group, self.along, ring, ENOUGH, self._ring_at)
         alone = around + self.hairy[:, None] * (self._hair(values) - around)
         return alone + self._seen_there[:, None] * (values[self._mirrored] - alone)
 

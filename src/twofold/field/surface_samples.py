@@ -92,7 +92,7 @@ def weighted_median(values: Float[np.ndarray, "n C"], weight: Float[np.ndarray, 
 
 def ring_medians(
     values: Float[np.ndarray, "n C"], trust: Float[np.ndarray, "n"], group: Int[np.ndarray, "n"],
-    along: Float[np.ndarray, "n"], height: float, enough: float,
+    along: Float[np.ndarray, "n"], height: float, enough: float, asked: Float[np.ndarray, "n"] | None = None,
 ) -> Float[np.ndarray, "n C"]:  # fmt: skip
     """For each point the median of what was observed of the same body part at the same height, on either side.
 
@@ -109,7 +109,9 @@ def ring_medians(
         along: place along the part, metres.
         height: of a ring, metres.
         enough: observed area that a ring needs, square metres.
+        asked: the place whose ring each point takes, metres; None for its own.
     """
+    at = along if asked is None else asked
     out = np.broadcast_to(weighted_median(values, trust), values.shape).copy()
     for part in np.unique(group):
         own = np.nonzero(group == part)[0]
@@ -121,7 +123,7 @@ def ring_medians(
         if pieces:
             places = np.array([along[piece].mean() for piece in pieces])
             table = np.array([weighted_median(values[piece], trust[piece]) for piece in pieces])
-            out[own] = np.stack([np.interp(along[own], places, column) for column in table.T], -1)
+            out[own] = np.stack([np.interp(at[own], places, column) for column in table.T], -1)
     return out
 
 

@@ -25,7 +25,7 @@ INSIDE, OUTSIDE = -0.02, 0.05
 """How far from the completed surface points are pulled, metres."""
 LOWEST, HIGHEST = -0.04, 0.09
 """How far the surface may lie from the body, metres."""
-ENOUGH = 0.9
+ENOUGH = 0.7
 """Weight from which a vertex is left alone."""
 WELL_OBSERVED = 0.9
 """Share of the surface from which on nothing is completed."""
@@ -35,6 +35,8 @@ SHAPE_RING = 0.02
 """Height of the rings that the distance of the surface from the body is taken from, metres."""
 LEAST_SLOPE, MOST_SLOPE = -0.1, 0.3
 """How much brighter, in natural logarithms, a surface may be taken to be that faces the cameras than one side on."""
+TURNED_AWAY = 0.5
+"""How much of that is taken on for surfaces that are turned away, beside those between these two."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,7 @@ class Completion(nn.Module):
         A camera that stands still cannot tell a surface that is bright from one that is lit from its side, so the law
         of light does not say how bright the other side is. Here the brightness within rings around the body does: with
         the mean cosine $f$ to the cameras, lit colours are $\exp(b f)$ times what is completed, and the slope $b$ is
-        that of `SurfaceFill.slope`.
+        that of `SurfaceFill.slope`; where $f < 0$ half of it, as light that comes from all sides is left there.
 
         Args:
             answer_at: the field.
@@ -177,7 +179,8 @@ class Completion(nn.Module):
             answer = answer_at(on.points + offset[:, None] * on.normals, on.nearest)
         lit = (answer.color.clamp_min(0.004) * light).cpu().numpy()
         slope = min(max(on.fill.slope(np.log(lit.mean(1))), LEAST_SLOPE), MOST_SLOPE)
-        brightness = np.exp(slope * on.fill.facing)[:, None]
+        facing = on.fill.facing
+        brightness = np.exp(slope * np.where(facing < 0, TURNED_AWAY * facing, facing))[:, None]
         found = torch.from_numpy(on.fill(lit / brightness) * brightness).to(self.target)
         self.target.copy_((found / light).clamp(0, 1))
         away = torch.from_numpy(on.fill(offset[:, None].cpu().numpy(), SHAPE_RING))[:, 0]

@@ -58,9 +58,9 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
             self.field.make_observable()
 
     def answer_beside(self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed) -> FieldOutput:
-        """See `SkinnedAvatar.answer_beside`; of feature grids it is without light."""
+        """See `SkinnedAvatar.answer_beside`; of feature grids it is without light, and their networks do not learn."""
         if isinstance(self.field, GridField):
-            return self.field.unlit(x_canonical, posed.own.condition)
+            return self.field.unlit_features(x_canonical, posed.own.condition)
         return super().answer_beside(x_canonical, vertex, posed)
 
     def light_beside(self, vertex: Int[Tensor, "S"], posed: Posed) -> Float[Tensor, "S 3"]:
