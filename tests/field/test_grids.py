@@ -6,6 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from little_body import ball
+from scipy import ndimage
 
 from twofold.field.grids import (
     FeatureGrid,
@@ -258,3 +259,22 @@ def test_bodies_with_hardly_any_vertices_have_distances_too():
     found = body_distance(np.array([[2, 2, 2], [0.2, 0.2, 0.2]], dtype=np.float32), vertices, faces)
     assert found[0] > 1
     assert found[1] < 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rows_of_stored_features_never_change(seed):
+    """A run's features belong to rows, so the corner and the size of a level are rounded as they always were."""
+    points = np.random.default_rng(seed).uniform(-1.2, 0.9, (400, 3)).astype(np.float32)
+    lattices, _ = build_lattices(points, (0.12, 0.06), 0.1)
+    for level, voxel in enumerate((0.12, 0.06)):
+        reach = 0.1 + np.sqrt(3) * voxel
+        low = points.min(0) - reach - voxel
+        assert np.array_equal(lattices.place[level, :3].numpy(), low.astype(np.float32))
+        size = np.ceil((points.max(0) + reach + voxel - low) / voxel).astype(int) + 1
+        assert lattices.shape[level, :3].tolist() == size.tolist()
+        empty = np.ones(size, dtype=bool)
+        empty[tuple(np.round((points - low) / voxel).astype(int).T)] = False
+        near = np.asarray(ndimage.distance_transform_edt(empty)) * voxel <= reach + voxel
+        begin = lattices.shape[level, 3]
+        rows = lattices.rows[begin : begin + near.size].view(*size)
+        assert np.array_equal((rows > rows.min()).numpy(), near)

@@ -95,12 +95,24 @@ def test_the_field_is_pulled_to_the_targets_in_every_pose(person, generator):
                 answers = [avatar.answer_beside(at, on.nearest, posed) for posed in poses]
             colors = [(answer.color - completion.target)[unseen].abs().mean() for answer in answers]
             errors.append((*colors, *(answer.sdf[unseen].abs().mean() for answer in answers)))
-        terms = completion.terms(lambda x, v, p=poses[step % 2]: avatar.answer_beside(x, v, p), 10, generator)
+        condition = poses[step % 2].own.condition
+        terms = completion.terms(lambda x, v, c=condition: avatar.field.unlit(x, c), 10, generator)
         optimizer.zero_grad()
         sum(terms.values()).backward()
         optimizer.step()
     for before, after, share in zip(*errors, (0.35, 0.35, 0.85, 0.85), strict=True):
         assert after < share * before
+
+
+def test_only_features_learn_from_completion(person, generator):
+    """Networks that learned what was observed would forget a little of it."""
+    avatar = prepared(person)
+    posed = avatar.pose(person.train[0].pose, person.train[0].translation)
+    terms = avatar.completion.terms(lambda x, v: avatar.answer_beside(x, v, posed), 1000, generator)
+    sum(terms.values()).backward()
+    learning = {name for name, p in avatar.field.named_parameters() if p.grad is not None and p.grad.any()}
+    assert learning == {"low_grid.table", "high_grid.table"}
+    assert all(p.requires_grad for p in avatar.field.parameters())
 
 
 def test_a_stored_avatar_is_the_same_again(runs, person, tmp_path):

@@ -65,9 +65,10 @@ def build_lattices(
         points = points if by_level is None else by_level[level]
         reach = radius + np.sqrt(3) * voxel
         # Of a part of the body two more layers, which hold no nodes: what lies outside is everywhere else there, too.
-        margin = reach + (1 if by_level is None else 3) * voxel
-        low = points.min(0) - margin
-        shape = np.ceil((points.max(0) + margin - low) / voxel).astype(int) + 1
+        more = 0.0 if by_level is None else 2 * voxel
+        # In this order: stored features belong to rows that another rounding would change.
+        low = points.min(0) - reach - voxel - more
+        shape = np.ceil((points.max(0) + reach + voxel + more - low) / voxel).astype(int) + 1
         empty = np.ones(shape, dtype=bool)
         empty[tuple(np.round((points - low) / voxel).astype(int).T)] = False
         away = np.asarray(ndimage.distance_transform_edt(empty))

@@ -13,7 +13,9 @@ ABSENT: dict[str, dict[str, object]] = {
         "lpips_dropout": 0.0, "lpips_off_box": "black", "s3im_center": 1.5, "eikonal_replacement": True,
         "base_mask": 0.0,
     },
-    "method.completion": {"color": 0.0, "shape": 0.0, "light": 0.0, "points": 512, "start": 200, "every": 200},
+    "method.completion": {
+        "color": 0.0, "shape": 0.0, "light": 0.0, "points": 512, "samples": 40_000, "start": 200, "every": 200,
+    },
     "training": {"epochs": "images"},
     "training.pixels": {
         "reachable": "body", "subject": "half", "between": False, "replacement": True, "memory_gb": 1.0,
