@@ -3,12 +3,13 @@
 Synthetic subjects filmed from the front only; the same training twice. Captures and runs are kept in a folder and used
 again, so it can be stopped and continued.
 
-python -m benchmarks.completion [--seeds 0 2] [--steps 700] [--size 160] [--work /tmp/twofold-completion]
+python -m benchmarks.completion [--seeds 0 2] [--steps 700] [--size 160] [--work FOLDER]
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -74,7 +75,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 2])
     parser.add_argument("--steps", type=int, default=700)
     parser.add_argument("--size", type=int, default=160)
-    parser.add_argument("--work", type=Path, default=Path("/tmp/twofold-completion"))
+    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "twofold-completion")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     tune_process()

@@ -51,7 +51,7 @@ class SurfaceSamples:
 def even_samples(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], kept: Float[np.ndarray, "F"], count: int
 ) -> SurfaceSamples:
-    """So many points, spread evenly over triangles; always the same ones.
+    """Points spread evenly over triangles; always the same ones.
 
     >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     >>> samples = even_samples(square, np.array([[0, 1, 2], [0, 2, 3]]), np.array([1.0, 0.0]), 400)
