@@ -51,7 +51,14 @@ class SurfaceSamples:
 def even_samples(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], kept: Float[np.ndarray, "F"], count: int
 ) -> SurfaceSamples:
-    """Points spread evenly over triangles; always the same ones.
+    r"""Points spread evenly over triangles; always the same ones.
+
+    Point $i$ of $n$ lies in the triangle at which the running sum of areas passes $(i + 1/2) / n$ of the whole, with the
+    barycentric coordinates
+
+    \[ (u_i, v_i) = \big( (i + \tfrac12) (\rho^{-1}, \rho^{-2}) \big) \bmod 1, \qquad \rho^3 = \rho + 1, \]
+
+    folded where $u + v > 1$.
 
     >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     >>> samples = even_samples(square, np.array([[0, 1, 2], [0, 2, 3]]), np.array([1.0, 0.0]), 400)
@@ -94,9 +101,11 @@ def ring_medians(
     values: Float[np.ndarray, "n C"], trust: Float[np.ndarray, "n"], group: Int[np.ndarray, "n"],
     along: Float[np.ndarray, "n"], height: float, enough: float, asked: Float[np.ndarray, "n"] | None = None,
 ) -> Float[np.ndarray, "n C"]:  # fmt: skip
-    """For each point the median of what was observed of the same body part at the same height, on either side.
+    r"""For each point the median of what was observed of the same body part at the same height, on either side.
 
-    Rings with too little of it take the values of those beside; parts without any, the median of all.
+    \[ g(p) = \operatorname{median}_{q} \{ v_q : \lfloor a_q / h \rfloor = \lfloor a_p / h \rfloor \} \text{ by } A_q \]
+
+    with the place $a$ along the part, the height $h$ and the observed area $A$; between the middles of rings linear. Rings with too little of it take the values of those beside; parts without any, the median of all.
 
     >>> values, along = np.array([[1.0], [2.0], [9.0], [0.0]]), np.array([0.0, 0.01, 0.01, 0.19])
     >>> ring_medians(values, np.array([1.0, 1, 1, 0]), np.zeros(4, int), along, 0.1, 0.5)[:, 0].tolist()
