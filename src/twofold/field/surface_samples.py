@@ -53,8 +53,7 @@ def even_samples(
 ) -> SurfaceSamples:
     r"""Points spread evenly over triangles; always the same ones.
 
-    Point $i$ of $n$ lies in the triangle at which the running sum of areas passes $(i + 1/2) / n$ of the whole, with the
-    barycentric coordinates
+    Point $i$ of $n$ lies in the triangle at which the running sum of areas passes $(i + 1/2) / n$ of the whole, at
 
     \[ (u_i, v_i) = \big( (i + \tfrac12) (\rho^{-1}, \rho^{-2}) \big) \bmod 1, \qquad \rho^3 = \rho + 1, \]
 
@@ -105,7 +104,8 @@ def ring_medians(
 
     \[ g(p) = \operatorname{median}_{q} \{ v_q : \lfloor a_q / h \rfloor = \lfloor a_p / h \rfloor \} \text{ by } A_q \]
 
-    with the place $a$ along the part, the height $h$ and the observed area $A$; between the middles of rings linear. Rings with too little of it take the values of those beside; parts without any, the median of all.
+    with the place $a$ along the part, the height $h$ and the observed area $A$; linear between the middles of rings.
+    Rings with too little of it take the values of those beside; parts without any, the median of all.
 
     >>> values, along = np.array([[1.0], [2.0], [9.0], [0.0]]), np.array([0.0, 0.01, 0.01, 0.19])
     >>> ring_medians(values, np.array([1.0, 1, 1, 0]), np.zeros(4, int), along, 0.1, 0.5)[:, 0].tolist()
