@@ -82,7 +82,7 @@ def sampling_ratios(avatar: FactorizedAvatar, shell: Shell, size: int) -> dict[s
     limit, step = avatar.config.sampler.reach, 0.01
 
     def build() -> None:
-        avatar.config.sampler.shell(shell.vertices, capture.body.faces, 6)
+        avatar.config.sampler.shell(shell.vertices, 6)
 
     centers = shell.vertices[shell.nearest[:, 0].long()].numpy().astype(np.float32)
     vertices = shell.vertices.numpy()

@@ -1,10 +1,14 @@
 """The field as one compiled operation against the same field in PyTorch, in double precision."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from test_factorized_grid import BODY, POSE_SIZE, SMALL, make, off_the_start, parameter_gradients
 
-from twofold.field.fused_kernels import TILE
+from twofold.field.fused_tile import TILE
+
+QUADS = replace(SMALL, features=4)
 
 
 @pytest.fixture
@@ -40,11 +44,12 @@ def partly_observed(field):
     return field
 
 
+@pytest.mark.parametrize("config", [SMALL, QUADS], ids=["two features", "four features"])
 @pytest.mark.parametrize(
     ("count", "change"), [(1, lambda f: f), (TILE, lambda f: f), (2 * TILE + 37, lambda f: f), (99, partly_observed)]
 )
-def test_values_and_gradients_of_any_number_of_samples_are_those_of_the_twin(count, change):
-    field, twin = change(off_the_start(make(SMALL))), change(off_the_start(make(SMALL))).double()
+def test_values_and_gradients_of_any_number_of_samples_are_those_of_the_twin(count, change, config):
+    field, twin = change(off_the_start(make(config))), change(off_the_start(make(config))).double()
     x, pose, turns = points(count)
     found, expected = trained_by(field, x, pose, turns), trained_by(twin, x.double(), pose.double(), turns.double())
     for name, gradient in expected.items():
@@ -74,7 +79,7 @@ def test_gradient_does_not_depend_on_the_samples_beside_it():
 
 
 def test_a_parameter_changed_before_the_reverse_pass_is_noticed():
-    field = off_the_start(make(SMALL))
+    field = off_the_start(make(QUADS))
     x, pose, turns = points(10)
     color = field(x, pose, turns).color.sum()
     with torch.no_grad():

@@ -25,7 +25,7 @@ def body():
 
 @pytest.fixture(scope="module")
 def shell(body):
-    return build_shell(body.vertices, body.faces, RADIUS, VOXEL)
+    return build_shell(body.vertices, RADIUS, VOXEL)
 
 
 def rays_towards(vertices, count=60, seed=0, dtype=torch.float32):
@@ -237,13 +237,13 @@ def test_the_generator_decides_everything(body, shell):
 @pytest.mark.parametrize("candidates", [1, 6])
 def test_bodies_with_hardly_any_vertices_have_shells_too(candidates):
     vertices = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
-    shell = build_shell(vertices, torch.tensor([[0, 1, 2]]), 0.05, 0.02, candidates)
+    shell = build_shell(vertices, 0.05, 0.02, candidates)
     assert shell.nearest.shape[1] == min(candidates, 3)
     assert int(shell.nearest.max()) == 2
     assert int(shell.nearest[shell.rows_at(vertices[1])][0]) == 1
 
 
 def test_the_voxel_list_is_the_same_for_a_posed_body_that_wants_gradients(body, shell):
-    again = build_shell(body.vertices.clone().requires_grad_(), body.faces, RADIUS, VOXEL)
+    again = build_shell(body.vertices.clone().requires_grad_(), RADIUS, VOXEL)
     np.testing.assert_array_equal(again.row, shell.row)
     assert not again.vertices.requires_grad

@@ -108,7 +108,7 @@ def test_samples_that_are_carried_to_another_part_are_air(dense, person):
     sampler, surface = dense.config.sampler, posed.own.surface
     placed = sampler.build(dense.deformation, dense.canonical_points, posed.body.faces).candidates(rays, surface, None)
     x = placed.x_canonical
-    canonical = build_shell(dense.canonical_points, posed.body.faces, sampler.radius, sampler.voxel)
+    canonical = build_shell(dense.canonical_points, sampler.radius, sampler.voxel)
     stray = miswarped(placed, rays, surface, canonical, 0.006)
     away = (placed.samples.points(rays) - posed.body.vertices[placed.nearest[:, 0]]).norm(dim=-1)
     nearer = away - torch.cdist(x, dense.canonical_points).amin(1)

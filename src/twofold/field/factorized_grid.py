@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from twofold.body.skeleton import JOINT_NAMES, PosedBody
 from twofold.config import require_within
-from twofold.field.fused import FusedField
+from twofold.field.fused import FusedField, in_quads
 from twofold.field.grids import (
     FeatureGrid,
     Lattices,
@@ -225,7 +225,7 @@ class GridField(nn.Module):
         width = float("inf") if config.gate_width is None else config.gate_width
         lattices = (prior, self.low_grid.lattices, self.high_grid.lattices)
         tables = (self.get_buffer("prior"), self.low_grid.table, self.high_grid.table)
-        return FusedField(*tables, lattices, nets, width)  # type: ignore[arg-type]
+        return in_quads(FusedField(*tables, lattices, nets, width))  # type: ignore[arg-type]
 
     def _gate(self, s1: Tensor) -> Tensor:
         if self.config.gate_width is None:

@@ -10,10 +10,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from twofold.field import fused_kernels as kernels
-from twofold.field import grid_kernels
+from twofold.field import fused_lookups as lookups
 from twofold.field.grids import Lattices
+from twofold.kernels.lanes import QUAD
 from twofold.kernels.parallel import in_parts
 
 _LAYERS = 6
@@ -30,7 +32,7 @@ class FusedField:
     Attributes:
         prior: signed distance to the body at the nodes of its lattices, metres; and, in a second column, how well the
             surface there was observed, which weakens the gate.
-        low: feature table of the low branch.
+        low: feature table of the low branch; see `in_quads`.
         high: feature table of the high branch.
         lattices: of prior, low and high grid.
         nets: distance and colour network of the low branch, then of the high one.
@@ -83,6 +85,24 @@ class FusedField:
         )
         nets = tuple(tuple(_array(tensor) for tensor in net) for net in self.nets)
         return grids, nets, np.float32(self.gate_width)
+
+
+def in_quads(field: FusedField) -> FusedField:
+    """The same field with features of zero added at each node, until they fill whole short vectors."""
+    channels = field.low.shape[1]
+    missing = -channels % QUAD
+    if not missing:
+        return field
+
+    def widened(net: Net, levels: int) -> Net:
+        weight, own = net[0], levels * channels
+        features = pad(weight[:, :own].unflatten(1, (levels, channels)), (0, missing)).flatten(1)
+        return (torch.cat([features, weight[:, own:]], 1), *net[1:])
+
+    low, high = (len(lattices.place) for lattices in field.lattices[1:])
+    nets = tuple(widened(net, levels) for net, levels in zip(field.nets, (low, low, high, high), strict=True))
+    tables = (pad(table, (0, missing)) for table in (field.low, field.high))
+    return FusedField(field.prior, *tables, field.lattices, nets, field.gate_width)  # type: ignore[arg-type]
 
 
 class _Colors(torch.autograd.Function):
@@ -138,50 +158,47 @@ def _by_values(
     field: FusedField, given: Any, slopes: tuple[np.ndarray, np.ndarray], cotangents: tuple[np.ndarray, ...], by_x: bool
 ) -> list[Any]:
     """Gradients by points (where wanted), law, tables and nets from those by s, s1, c and c1."""
-    count = len(given[0])
-    by_low, by_high = (torch.empty(count, table.shape[1] * len(at.place)) for table, at in _grids(field))
-    by_prior = torch.empty(count)
-    stored = (by_low.numpy(), by_high.numpy(), by_prior.numpy())
+    count, (_, *grids) = len(given[0]), given[1]
+    features = [np.empty((count, table.shape[1] * len(place)), np.float32) for table, _, place, _ in grids]
+    points = torch.empty(count, 3)
 
     def part(begin: int, end: int) -> tuple[list[tuple[np.ndarray, ...]], np.ndarray]:
         by_nets, by_law = _zeros(field), np.zeros((3, 9), np.float32)
-        kernels.backward(*given, *slopes, *cotangents, *stored, tuple(by_nets), by_law, begin, end)
+        kernels.backward(
+            *given, *slopes, *cotangents, *features, points.numpy(), by_x, tuple(by_nets), by_law, begin, end
+        )
         return by_nets, by_law
 
     parts = in_parts(count, part)
-    points = _by_points(field, given[0], by_low, by_high, by_prior) if by_x else None
     tables = [
-        _scattered(grid_kernels.scatter, table, at, given[0], u.numpy())
-        for (table, at), u in zip(_grids(field), (by_low, by_high), strict=True)
+        _scattered(lookups.scatter, table, grid, given[0], u)
+        for table, grid, u in zip((field.low, field.high), grids, features, strict=True)
     ]
-    return [points, _summed([law for _, law in parts]), *tables, *_by_nets([nets for nets, _ in parts])]
+    by_law = _summed([law for _, law in parts])
+    return [points if by_x else None, by_law, *tables, *_by_nets([nets for nets, _ in parts])]
 
 
 def _by_slopes(field: FusedField, given: Any, by_g: np.ndarray) -> list[Tensor]:
     """Gradients by tables and nets from those by the distance's gradient."""
-    count = len(by_g)
-    low, high = (np.empty((count, table.shape[1] * len(at.place)), np.float32) for table, at in _grids(field))
+    count, (_, *grids) = len(by_g), given[1]
+    features = [np.empty((count, table.shape[1] * len(place)), np.float32) for table, _, place, _ in grids]
     pushed = np.empty((count, 3), np.float32)
 
     def part(begin: int, end: int) -> list[tuple[np.ndarray, ...]]:
         by_nets = _zeros(field)
-        kernels.gradient_backward(*given, by_g, low, high, pushed, tuple(by_nets), begin, end)
+        kernels.gradient_backward(*given, by_g, *features, pushed, tuple(by_nets), begin, end)
         return by_nets
 
     parts = in_parts(count, part)
     tables = [
-        _scattered(grid_kernels.pull_scatter, table, at, given[0], cotangent, slope)
-        for (table, at), cotangent, slope in zip(_grids(field), (low, high), (by_g, pushed), strict=True)
+        _scattered(lookups.scatter_slopes, table, grid, given[0], u, slope)
+        for table, grid, u, slope in zip((field.low, field.high), grids, features, (by_g, pushed), strict=True)
     ]
     return [*tables, *_by_nets(parts)]
 
 
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
-
-
-def _grids(field: FusedField) -> tuple[tuple[Tensor, Lattices], tuple[Tensor, Lattices]]:
-    return (field.low, field.lattices[1]), (field.high, field.lattices[2])
 
 
 def _zeros(field: FusedField) -> list[tuple[np.ndarray, ...]]:
@@ -198,24 +215,8 @@ def _by_nets(parts: list[list[tuple[np.ndarray, ...]]]) -> list[Tensor]:
     return [_summed([part[net][k] for part in parts]) for net in range(4) for k in range(_LAYERS)]
 
 
-def _scattered(kernel: Callable[..., None], table: Tensor, at: Lattices, *arrays: np.ndarray) -> Tensor:
+def _scattered(kernel: Callable[..., None], table: Tensor, grid: Any, *arrays: np.ndarray) -> Tensor:
     """Gradient by a table; a level owns its rows, so levels run side by side."""
     by_table = torch.zeros_like(table)
-    given = (*arrays, *(_array(tensor) for tensor in (at.rows, at.place, at.shape)), by_table.numpy())
-    in_parts(len(at.place), lambda begin, end: kernel(*given, begin, end), least=1)
+    in_parts(len(grid[2]), lambda begin, end: kernel(*arrays, grid, by_table.numpy(), begin, end), least=1)
     return by_table
-
-
-def _by_points(field: FusedField, x: np.ndarray, low: Tensor, high: Tensor, prior: Tensor) -> Tensor:
-    """Gradient by the points from those by all features."""
-    total = torch.zeros(len(x), 3)
-    # What was observed weakens the gate as a constant.
-    prior = torch.nn.functional.pad(prior[:, None], (0, field.prior.shape[1] - 1))
-    tables = (field.low, field.high, field.prior)
-    lattices = (field.lattices[1], field.lattices[2], field.lattices[0])
-    for table, at, cotangent in zip(tables, lattices, (low, high, prior), strict=True):
-        out = torch.empty_like(total)
-        arrays = (x, _array(table), cotangent.numpy(), *(_array(t) for t in (at.rows, at.place, at.shape)), out.numpy())
-        in_parts(len(x), lambda begin, end, a=arrays: grid_kernels.pull(*a, begin, end))
-        total += out
-    return total

@@ -10,11 +10,11 @@ scatters, which own their rows) that a call handles.
 
 import numpy as np
 
-from twofold.kernels.parallel import compiled
+from twofold.kernels.parallel import compiled, compiled_part
 
 
-@compiled
-def _cell(x, place, shape):  # noqa: ANN001, ANN202
+@compiled_part
+def cell(x, place, shape):  # noqa: ANN001, ANN201
     """Lower node of the cell and position in it; points outside are moved to the border."""
     u = min(max((x[0] - place[0]) * place[3], np.float32(0)), shape[0] - np.float32(1.001))
     v = min(max((x[1] - place[1]) * place[3], np.float32(0)), shape[1] - np.float32(1.001))
@@ -31,7 +31,7 @@ def interpolate(x, table, rows, place, shape, out, begin, end):  # noqa: ANN001,
     one = np.float32(1)
     for s in range(begin, end):
         for level in range(place.shape[0]):
-            base, u, v, w = _cell(x[s], place[level], shape[level])
+            base, u, v, w = cell(x[s], place[level], shape[level])
             stride_i, stride_j = shape[level, 1] * shape[level, 2], shape[level, 2]
             at = level * channels
             for c in range(channels):
@@ -56,7 +56,7 @@ def scatter(x, gradient, rows, place, shape, by_table, begin, end):  # noqa: ANN
         stride_i, stride_j = shape[level, 1] * shape[level, 2], shape[level, 2]
         at = level * channels
         for s in range(x.shape[0]):
-            base, u, v, w = _cell(x[s], place[level], shape[level])
+            base, u, v, w = cell(x[s], place[level], shape[level])
             for a in range(2):
                 wa = u if a else one - u
                 for b in range(2):
@@ -76,7 +76,7 @@ def pull(x, table, cotangent, rows, place, shape, out, begin, end):  # noqa: ANN
     for s in range(begin, end):
         gx, gy, gz = np.float32(0), np.float32(0), np.float32(0)
         for level in range(place.shape[0]):
-            base, u, v, w = _cell(x[s], place[level], shape[level])
+            base, u, v, w = cell(x[s], place[level], shape[level])
             stride_i, stride_j = shape[level, 1] * shape[level, 2], shape[level, 2]
             at = level * channels
             scale = place[level, 3]
@@ -106,7 +106,7 @@ def pull_scatter(x, cotangent, gradient, rows, place, shape, by_table, begin, en
         at = level * channels
         scale = place[level, 3]
         for s in range(x.shape[0]):
-            base, u, v, w = _cell(x[s], place[level], shape[level])
+            base, u, v, w = cell(x[s], place[level], shape[level])
             for a in range(2):
                 wa, da = (u, scale) if a else (one - u, -scale)
                 for b in range(2):
@@ -127,7 +127,7 @@ def push(x, table, gradient, rows, place, shape, out, begin, end):  # noqa: ANN0
     one = np.float32(1)
     for s in range(begin, end):
         for level in range(place.shape[0]):
-            base, u, v, w = _cell(x[s], place[level], shape[level])
+            base, u, v, w = cell(x[s], place[level], shape[level])
             stride_i, stride_j = shape[level, 1] * shape[level, 2], shape[level, 2]
             at = level * channels
             scale = place[level, 3]

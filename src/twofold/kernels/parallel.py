@@ -12,6 +12,9 @@ import torch
 from numba.core.caching import FunctionCache
 
 Result = TypeVar("Result")
+_OPTIONS: dict[str, Any] = {"nogil": True, "no_cfunc_wrapper": True}
+"""Without the interpreter's lock; nothing calls a loop from C."""
+_PART_OPTIONS: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True}
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -19,7 +22,18 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     A function that another one wraps, as checks of shapes do in the tests, is compiled as it was written.
     """
-    kernel: Any = numba.njit(nogil=True)(inspect.unwrap(function))
+    return _kept(numba.njit(**_OPTIONS)(inspect.unwrap(function)))
+
+
+def compiled_part(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compiles what only other compiled loops call, without a way in from Python.
+
+    That way takes longer to compile than many a loop, where arguments are tuples of arrays.
+    """
+    return _kept(numba.njit(**_PART_OPTIONS)(inspect.unwrap(function)))
+
+
+def _kept(kernel: Any) -> Any:
     # Without any folder to keep results in, numba raises; compiling anew in each process takes some seconds.
     with contextlib.suppress(RuntimeError, OSError):
         kernel._cache = _Cache(kernel.py_func)

@@ -3,7 +3,6 @@
 Poses and their refinement, samples and their way to canonical space, density and compositing, the common losses.
 """
 
-import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -82,8 +81,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         self._shells: dict[int, Shell] = {}
         self._bodies = {torch.device("cpu"): subject.body}
         self._perceptual: tuple[LPIPS, ...] = ()
-        weigh = functools.partial(weights_by, config.falloff, scale=self.scale)
-        self.deformation = Deformation(weigh, config.outlier_distance / self.scale, self.scale)
+        self.deformation = Deformation(config.falloff, config.outlier_distance / self.scale, self.scale)
         self._sampler: Sampler = config.sampler.build(self.deformation, canonical.canonical_vertices, canonical.faces)
         self.completion: Completion | None = None
         if config.completion.active:
@@ -265,14 +263,14 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         row = self.refinement.rows.get(frame_index) if mode.training and frame_index is not None else None
         if row is None:
             # Surfaces are taken from a pose without looking into its shell, which takes longer than all the rest.
-            return lambda: sampler.shell(body.vertices, body.faces, neighbours)
+            return lambda: sampler.shell(body.vertices, neighbours)
         if row not in self._shells:
             with torch.no_grad():
                 shaped = self._shape(self.shell_shape)
                 start = pose_body(shaped, self.shell_poses[row], self.shell_translations[row])
             if len(self._shells) >= SHELLS_KEPT:
                 self._shells.pop(next(iter(self._shells)))
-            self._shells[row] = sampler.shell(start.vertices, body.faces, neighbours)
+            self._shells[row] = sampler.shell(start.vertices, neighbours)
         shell = self._shells[row]
         return lambda: shell
 

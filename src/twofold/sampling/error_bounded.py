@@ -171,11 +171,9 @@ class ErrorBoundedSampler:
         """How far from the body samples can be, metres."""
         return RELEASED_MARGIN
 
-    def shell(
-        self, body: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], neighbours: int, margin: float = 0.0
-    ) -> Shell:
+    def shell(self, body: Float[Tensor, "V 3"], neighbours: int, margin: float = 0.0) -> Shell:
         """A coarse shell, which this sampler does not use; others that look at a posed avatar may."""
-        return build_shell(body, faces, 0.1, 0.03, max(6, 2 * neighbours))
+        return build_shell(body, 0.1, 0.03, max(6, 2 * neighbours))
 
     def ray_box(
         self, joints: Float[Tensor, "24 3"], given: Callable[[], Float[Tensor, "24 3"]], scale: float

@@ -2,19 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from twofold.deform.skinning import map_to_canonical, with_pose_gradient
+from twofold.deform.skinning import map_to_canonical, weights_by, with_pose_gradient
 from twofold.geometry.cameras import Rays
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.volume.samples import Samples
-
-NeighbourWeights = Callable[[Float[Tensor, "S K"]], Float[Tensor, "S K"]]
-"""The weights of the K nearest vertices from their squared distances, metres squared."""
 
 Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 """A field's signed distance at canonical points, metres."""
@@ -25,14 +22,18 @@ class Deformation:
     """How samples are mapped to canonical space.
 
     Attributes:
-        weigh: the weights of the nearest vertices.
+        falloff: how the nearest vertices count, as `deform.skinning.weights_by` has it.
         outlier_distance: samples further than this from the body count as empty, metres.
         scale: scene units per metre: 1, or the release's normalisation.
     """
 
-    weigh: NeighbourWeights
+    falloff: Literal["exponential", "scene", "smooth"]
     outlier_distance: float
     scale: float = 1.0
+
+    def weigh(self, squared_distances: Float[Tensor, "S K"]) -> Float[Tensor, "S K"]:
+        """The weights of the K nearest vertices from their squared distances, metres squared."""
+        return weights_by(self.falloff, squared_distances, self.scale)
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 from torch import Tensor
 
 from twofold.geometry.cameras import Rays, clip_to_box
 from twofold.kernels.kdtree import query_nearest, search_tree
+from twofold.kernels.lanes import LANES
 from twofold.kernels.parallel import in_parts
-from twofold.sampling import shell_kernels
+from twofold.sampling import shell_kernels, voxel_kernels
 from twofold.volume.samples import Samples
 
 
@@ -50,7 +51,7 @@ class Shell:
         r"""Row of the voxel $\lfloor (x - l) / h \rfloor$ that each point lies in, or a negative number.
 
         >>> corners = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
-        >>> shell = build_shell(corners, torch.tensor([[0, 1, 2]]), radius=0.05, voxel=0.02)
+        >>> shell = build_shell(corners, radius=0.05, voxel=0.02)
         >>> shell.rows_at(torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.0, 0.3]])) >= 0
         tensor([ True, False])
         """
@@ -62,9 +63,7 @@ class Shell:
         return torch.where(inside, self.row.flatten()[torch.where(inside, flat, 0).long()], -1).long()
 
 
-def build_shell(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], radius: float, voxel: float, candidates: int = 6
-) -> Shell:
+def build_shell(vertices: Float[Tensor, "V 3"], radius: float, voxel: float, candidates: int = 6) -> Shell:
     r"""Lists the voxels within `radius` of the vertices, and for each the vertices that may be nearest in it.
 
     A voxel with the centre $c$ and the edge $h$ is listed where
@@ -74,64 +73,60 @@ def build_shell(
     so that no point within $r$ of a vertex is missed.
 
     >>> corners = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
-    >>> shell = build_shell(corners, torch.tensor([[0, 1, 2]]), radius=0.05, voxel=0.02, candidates=2)
+    >>> shell = build_shell(corners, radius=0.05, voxel=0.02, candidates=2)
     >>> shell.nearest.shape[1], bool(shell.rows_at(corners + 0.02).min() >= 0)
     (2, True)
 
     Args:
         vertices: posed (or canonical) vertices, metres.
-        faces: triangles; their centres count as surface too, for bodies with large triangles.
         radius: metres.
         voxel: metres.
         candidates: how many vertices a voxel lists.
     """
     points = vertices.detach().cpu().numpy().astype(np.float32)
-    surface = np.concatenate([points, points[faces.cpu().numpy()].mean(1)])
-    low = surface.min(0) - radius - 2 * voxel
-    shape = np.ceil((surface.max(0) + radius + 2 * voxel - low) / voxel).astype(int)
-    seeds = np.ones(shape, dtype=bool)
-    seeds[tuple(((surface - low) / voxel).astype(int).T)] = False
-    # A voxel is off the surface's own voxel by at most one diagonal, so this keeps a superset of the true shell.
-    away = np.asarray(ndimage.distance_transform_edt(seeds))
-    reach = radius / voxel + np.sqrt(3)
-    near = np.argwhere(away <= reach)
-    centers = (low + (near + 0.5) * voxel).astype(np.float32)
+    low = points.min(0) - radius - 2 * voxel
+    # An even number of voxels along each axis: empty space is measured in blocks of two.
+    shape = 2 * np.ceil((points.max(0) + radius + 2 * voxel - low) / (2 * voxel)).astype(int)
     limit = radius + np.sqrt(3) / 2 * voxel
-    distance, index = _listed(points, low, voxel, limit, away <= reach, centers, min(candidates, len(points)))
-    keep = distance[:, 0] <= limit
-    row = -1 - np.maximum(away - reach, 0).astype(np.int32)
-    row[tuple(near[keep].T)] = np.arange(keep.sum(), dtype=np.int32)
+    inside, row = np.zeros(shape, dtype=bool), np.empty(shape, np.int32)
+    given = (points, low, voxel, limit, inside)
+    in_parts(len(row), lambda begin, end: voxel_kernels.mark(*given, begin, end), least=8)
+    empty = np.ones(shape // 2, dtype=bool)
+    count = voxel_kernels.number(inside, row, empty)
+    nearest = _listed(points, low, voxel, limit, row, count, min(candidates, len(points)))
+    voxel_kernels.tell_distance(row, np.asarray(ndimage.distance_transform_edt(empty)))
     device = vertices.device
     return Shell(
         low=torch.as_tensor(low, device=device),
         voxel=voxel,
         radius=radius,
         row=torch.as_tensor(row, device=device),
-        nearest=torch.as_tensor(index[keep].astype(np.int32), device=device),
+        nearest=torch.as_tensor(nearest, device=device),
         vertices=vertices.detach().float(),
     )
 
 
 def _listed(
     points: Float[np.ndarray, "V 3"], low: Float[np.ndarray, "3"], voxel: float, limit: float,
-    near: Bool[np.ndarray, "X Y Z"], centers: Float[np.ndarray, "N 3"], count: int,
-) -> tuple[Float[np.ndarray, "N C"], Int[np.ndarray, "N C"]]:  # fmt: skip
-    """Distances of the `count` vertices nearest to voxels' centres, and which these are, nearest first.
+    row: Int[np.ndarray, "X Y Z"], rows: int, count: int,
+) -> Int[np.ndarray, "N C"]:  # fmt: skip
+    """The `count` vertices nearest to the centres of the voxels, nearest first.
 
     A search tree answers for each voxel apart. It is quicker to let each vertex offer itself to the voxels nearby, and
-    to ask the tree only where that leaves a list short.
+    to ask the tree only where that leaves a list short, or where lists are longer than a vector.
     """
-    rows = np.where(near, np.cumsum(near, dtype=np.int32).reshape(near.shape) - 1, -1).astype(np.int32)
-    index = np.zeros((len(centers), count), np.int32)
-    squares = np.full((len(centers), count), np.inf, np.float32)
-    given = (points, low.astype(np.float32), voxel, limit + voxel / 2, rows, index, squares)
-    in_parts(near.shape[0], lambda begin, end: shell_kernels.list_vertices(*given, begin, end), least=8)
-    # Voxels without any vertex within the limit are no part of the shell.
-    short = np.nonzero(np.isinf(squares[:, -1]) & (squares[:, 0] <= (limit + voxel / 2) ** 2))[0]
-    distance = np.sqrt(squares)
+    numbers, squares = np.zeros((rows, LANES), np.float32), np.full((rows, LANES), np.inf, np.float32)
+    if count <= LANES:
+        given = (points, low, voxel, limit + voxel / 2, row, count, numbers, squares)
+        in_parts(len(row), lambda begin, end: voxel_kernels.list_vertices(*given, begin, end), least=8)
+    index = np.zeros((rows, count), np.int32)
+    index[:, :LANES] = numbers[:, :count]
+    short = np.flatnonzero(np.isinf(squares[:, min(count, LANES) - 1]))
     if len(short):
-        distance[short], index[short] = query_nearest(search_tree(points, quick=True), centers[short], count)
-    return distance, index
+        places = np.stack(np.unravel_index(np.flatnonzero(row.ravel() >= 0)[short], row.shape), 1)
+        centers = (low + (places + 0.5) * voxel).astype(np.float32)
+        index[short] = query_nearest(search_tree(points, quick=True), centers, count)[1]
+    return index
 
 
 def nearest_listed(
@@ -144,7 +139,7 @@ def nearest_listed(
     and so on, among the candidates $C(x)$ of the point's voxel.
 
     >>> corners = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
-    >>> shell, x = build_shell(corners, torch.tensor([[0, 1, 2]]), 0.05, 0.02), torch.tensor([[0.09, 0.0, 0.02]])
+    >>> shell, x = build_shell(corners, 0.05, 0.02), torch.tensor([[0.09, 0.0, 0.02]])
     >>> nearest_listed(shell, x, shell.rows_at(x), k=1)
     (tensor([[1]]), tensor([[0.0005]]))
 
@@ -172,7 +167,7 @@ def sample_shell(
     with $u$ random for each ray, or a half.
 
     >>> corners = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
-    >>> shell = build_shell(corners, torch.tensor([[0, 1, 2]]), radius=0.05, voxel=0.02)
+    >>> shell = build_shell(corners, radius=0.05, voxel=0.02)
     >>> ray = Rays(torch.tensor([[0.0, 0, -1]]), torch.tensor([[0.0, 0, 1]]), torch.zeros(1), torch.tensor([2.0]))
     >>> samples, nearest, squared = sample_shell(shell, ray, step=0.02, generator=None, limit=0.03)
     >>> samples.depth.round(decimals=2), nearest[:, 0].tolist()
@@ -189,19 +184,26 @@ def sample_shell(
     Returns:
         packed samples, the nearest listed vertices of each, and their squared distances (metres squared).
     """
-    clipped, hit = clip_to_box(rays, shell.low, shell.high)
-    ray_ids = hit.nonzero()[:, 0]
     device = rays.origins.device
-    start = torch.full_like(rays.near, 0.5)
-    if generator is not None:
-        start = torch.rand(len(rays), generator=generator, device=generator.device).to(device)
-    clipped, start = clipped[ray_ids], start[ray_ids]
+    clipped, ray_ids, start = ray_starts(shell, rays, generator)
     if len(ray_ids) == 0:
         none = torch.zeros(0, device=device)
         return Samples(ray_ids, none, none), ray_ids[:, None].expand(0, k), none[:, None].expand(0, k)
     find = _walk_in_torch if device.type != "cpu" or rays.origins.dtype != torch.float32 else _walk_compiled
     ray, depth, nearest, squared = find(shell, clipped, start, step, limit, k)
     return Samples(ray_ids[ray], depth, torch.full_like(depth, step)), nearest, squared
+
+
+def ray_starts(
+    shell: Shell, rays: Rays, generator: torch.Generator | None
+) -> tuple[Rays, Int[Tensor, "r"], Float[Tensor, "r"]]:
+    """The rays that meet the shell's box, clipped to it, which ones these are, and where in a step each one begins."""
+    clipped, hit = clip_to_box(rays, shell.low, shell.high)
+    ray_ids = hit.nonzero()[:, 0]
+    start = torch.full_like(rays.near, 0.5)
+    if generator is not None:
+        start = torch.rand(len(rays), generator=generator, device=generator.device).to(rays.near.device)
+    return clipped[ray_ids], ray_ids, start[ray_ids]
 
 
 def _walk_compiled(

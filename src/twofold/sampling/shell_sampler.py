@@ -15,6 +15,7 @@ from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.pruning import miswarped, visible
 from twofold.sampling.sdf_grid import SdfGrid, tabulate
 from twofold.sampling.shell import Shell, build_shell, sample_shell
+from twofold.sampling.shell_walk import can_walk, walk_to_canonical
 
 _GRID_PAYS = 150_000
 """Samples from which on an SDF grid at 15 mm, of some eighty thousand nodes, is the quicker way."""
@@ -54,9 +55,9 @@ class ShellSampler:
         """How far from the body samples can be, metres."""
         return self.radius
 
-    def shell(self, body: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], neighbours: int) -> Shell:
+    def shell(self, body: Float[Tensor, "V 3"], neighbours: int) -> Shell:
         """The shell around a body, with enough candidates for that many neighbours."""
-        return build_shell(body, faces, self.radius, self.voxel, max(6, 2 * neighbours))
+        return build_shell(body, self.radius, self.voxel, max(6, 2 * neighbours))
 
     def ray_box(
         self, joints: Float[Tensor, "24 3"], given: Callable[[], Float[Tensor, "24 3"]], scale: float
@@ -68,16 +69,16 @@ class ShellSampler:
         self, deformation: Deformation, canonical: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
     ) -> "ShellPlacer":
         """The sampler of one avatar, around its canonical body."""
-        return ShellPlacer(self, deformation, canonical, faces)
+        return ShellPlacer(self, deformation, canonical)
 
 
 class ShellPlacer:
     """See `ShellSampler`. Keeps the canonical shell, and the SDF grid of the last pose."""
 
-    def __init__(self, config: ShellSampler, deformation: Deformation, canonical: Tensor, faces: Tensor) -> None:
+    def __init__(self, config: ShellSampler, deformation: Deformation, canonical: Tensor) -> None:
         """Nothing is built yet."""
         self.config, self.deformation = config, deformation
-        self._canonical, self._faces = canonical, faces
+        self._canonical = canonical
         self._canonical_shell: Shell | None = None
         self._last_grid: tuple[PosedSurface, tuple[int, ...], SdfGrid] | None = None
 
@@ -85,37 +86,48 @@ class ShellPlacer:
         self, rays: Rays, surface: PosedSurface, query: FieldQuery, training: bool, generator: torch.Generator | None
     ) -> Placement:
         """See `twofold.sampling.placement.Sampler`."""
-        placed = self.candidates(rays, surface, generator)
-        if len(placed.samples) == 0:
+        placed, least = self.well_warped(rays, surface, generator), self.config.min_weight
+        if len(placed.samples) == 0 or least == 0:
             return placed
-        config, kept = self.config, None
-        if config.miswarp_slack > 0:
-            shell = self.canonical_shell(surface.forward.device)
-            kept = (~miswarped(placed, rays, surface, shell, config.miswarp_slack)).nonzero()[:, 0]
-        if config.min_weight > 0:
-            left = placed.samples if kept is None else placed.samples[kept]
-            x_canonical = placed.x_canonical if kept is None else placed.x_canonical[kept]
-            grid = None if training else self._grid(len(left), surface, query)
-            seen = visible(left, x_canonical, len(rays), query.distance, query.beta, config.min_weight, grid)
-            kept = seen if kept is None else kept[seen]
-        return placed if kept is None else placed[kept]
+        grid = None if training else self._grid(len(placed.samples), surface, query)
+        return placed[visible(placed.samples, placed.x_canonical, len(rays), query.distance, query.beta, least, grid)]
+
+    @torch.no_grad()
+    def well_warped(self, rays: Rays, surface: PosedSurface, generator: torch.Generator | None) -> Placement:
+        """`candidates` without those that are mis-warped."""
+        slack, shell = self.config.miswarp_slack, self._shell(surface)
+        if can_walk(shell, rays):
+            canonical = self.canonical_shell(surface.forward.device) if slack > 0 else shell
+            limit = min(self.config.radius, self.deformation.outlier_distance)
+            return walk_to_canonical(
+                shell, rays, self.config.step, generator, limit, surface.neighbours, self.deformation, surface.forward,
+                canonical, slack,
+            )  # fmt: skip
+        placed = self.candidates(rays, surface, generator)
+        if slack == 0 or len(placed.samples) == 0:
+            return placed
+        stray = miswarped(placed, rays, surface, self.canonical_shell(surface.forward.device), slack)
+        return placed[(~stray).nonzero()[:, 0]]
 
     @torch.no_grad()
     def candidates(self, rays: Rays, surface: PosedSurface, generator: torch.Generator | None) -> Placement:
         """Every sample of the rays in the shell; a generator jitters each ray's evenly spaced samples together."""
         deformation = self.deformation
         limit = min(self.config.radius, deformation.outlier_distance)
-        # A shell may have been built before the body's last small corrections.
-        shell, step = replace(surface.shell, vertices=surface.body.vertices.detach()), self.config.step
-        samples, nearest, squared = sample_shell(shell, rays, step, generator, limit, surface.neighbours)
+        shell = self._shell(surface)
+        samples, nearest, squared = sample_shell(shell, rays, self.config.step, generator, limit, surface.neighbours)
         outlier = torch.zeros(len(samples), dtype=torch.bool, device=squared.device)
         return placement(samples, rays, nearest, deformation.weigh(squared), outlier, surface)
+
+    def _shell(self, surface: PosedSurface) -> Shell:
+        """The body's shell; it may have been built before the body's last small corrections."""
+        return replace(surface.shell, vertices=surface.body.vertices.detach())
 
     def canonical_shell(self, device: torch.device) -> Shell:
         """The shell around the canonical body."""
         if self._canonical_shell is None or self._canonical_shell.vertices.device != device:
-            points, faces = self._canonical.to(device), self._faces.to(device)
-            self._canonical_shell = build_shell(points, faces, self.config.radius, self.config.voxel)
+            points = self._canonical.to(device)
+            self._canonical_shell = build_shell(points, self.config.radius, self.config.voxel)
         return self._canonical_shell
 
     def _grid(self, samples: int, surface: PosedSurface, query: FieldQuery) -> SdfGrid | None:

@@ -1,0 +1,206 @@
+"""Rays walked through a shell, each sample mapped to canonical space on the way; `shell_walk` has the arrays.
+
+One look at a sample's candidates gives its nearest vertices, their weights, its canonical position, and whether it is
+mis-warped. `shell_kernels`, `skinning_kernels` and `pruning` do the same one after the other.
+"""
+
+# pyright: reportMissingParameterType=false
+
+import numpy as np
+
+from twofold.kernels.lanes import (
+    LANES,
+    apart,
+    distinct,
+    fill,
+    load,
+    minus,
+    one_more_where_less,
+    scaled,
+    spread,
+    store,
+    times_plus,
+)
+from twofold.kernels.parallel import compiled, compiled_part
+
+_FAR = np.float32(1e9)
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+@compiled
+def walk_to_canonical(shell, rays, canonical, limit, slack, smooth, scale, forward, k, begin, end):  # noqa: ANN001, ANN201
+    """Samples of rays begin..end within `limit` metres of their nearest listed vertex, mis-warped ones left out.
+
+    Args:
+        shell: (low, voxel, row, nearest, vertices) of a `Shell` with at most 16 candidates a voxel.
+        rays: (origins, directions, near, far, start, step); see `shell_kernels.walk`.
+        canonical: the shell of the canonical body.
+        limit: metres.
+        slack: a sample that comes closer to the canonical body by more than this is mis-warped, metres; 0 keeps all.
+        smooth: weights are those of `smooth_neighbour_weights`, else of `neighbour_weights`.
+        scale: scene units per metre for the latter.
+        forward: canonical-to-posed transform of each vertex, [V 16], row by row, the last four numbers zero.
+        k: how many nearest vertices blend.
+        begin: first ray.
+        end: ray behind the last.
+
+    Returns:
+        ray, depth, k nearest vertices and their weights, canonical point, and inverse transform [S 12] of each sample.
+    """
+    low, voxel, row, nearest, vertices = shell
+    other_low, other_voxel, other_row, other_nearest, other_vertices = canonical
+    ray_at, depth_at, row_at = _follow(rays, low, voxel, row, begin, end)
+    room = row_at.shape[0]
+    ray_of, depth_of = np.empty(room, np.int64), np.empty(room, np.float32)
+    vertex_of, weight_of = np.empty((room, k), np.int64), np.empty((room, k), np.float32)
+    point_of, inverse_of = np.empty((room, 3), np.float32), np.empty((room, 12), np.float32)
+    found, squares, weights = np.zeros(LANES, np.int64), np.full(LANES, _FAR, np.float32), np.empty(k, np.float32)
+    around, buffer = np.full((3, LANES), _FAR, np.float32), np.empty((3, LANES), np.float32)
+    origins, directions = rays[0], rays[1]
+    count = 0
+    # Hardly any branch depends on the data, so the processor fetches the next samples' lists beforehand.
+    for i in range(room):
+        r, depth, at = ray_at[i], depth_at[i], row_at[i]
+        x = origins[r, 0] + depth * directions[r, 0]
+        y = origins[r, 1] + depth * directions[r, 1]
+        z = origins[r, 2] + depth * directions[r, 2]
+        for j in range(nearest.shape[1]):
+            v = nearest[at, j]
+            around[0, j], around[1, j], around[2, j] = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+        _nearest(x, y, z, around, nearest, at, buffer, found, squares)
+        _weigh(squares, smooth, scale, weights)
+        _map(x, y, z, found, weights, forward, buffer, inverse_of, point_of, count)
+        ray_of[count], depth_of[count] = r, depth
+        for j in range(k):
+            vertex_of[count, j], weight_of[count, j] = found[j], weights[j]
+        kept = squares[0] < limit * limit
+        away = np.sqrt(squares[0]) - slack
+        if kept and slack > 0 and away > 0:
+            kept = not _is_closer(
+                point_of[count, 0], point_of[count, 1], point_of[count, 2], away * away,
+                other_low, other_voxel, other_row, other_nearest, other_vertices,
+            )  # fmt: skip
+        count += int(kept)
+    return ray_of[:count], depth_of[:count], vertex_of[:count], weight_of[:count], point_of[:count], inverse_of[:count]
+
+
+@compiled_part
+def _follow(rays, low, voxel, row, begin, end):  # noqa: ANN001, ANN202
+    """Ray, depth and row of every sample in a listed voxel."""
+    origins, directions, near, far, start, step = rays
+    room = (end - begin) * 24 + 64
+    ray_of, depth_of, row_of = np.empty(room, np.int64), np.empty(room, np.float32), np.empty(room, np.int32)
+    count = 0
+    inverse = np.float32(1 / voxel)
+    for r in range(begin, end):
+        steps = int(np.ceil((far[r] - near[r]) / step))
+        i = 0
+        while i < steps:
+            depth = np.float32(near[r] + step * (i + start[r]))
+            if depth >= far[r]:
+                break
+            a = int(np.floor((origins[r, 0] + depth * directions[r, 0] - low[0]) * inverse))
+            b = int(np.floor((origins[r, 1] + depth * directions[r, 1] - low[1]) * inverse))
+            c = int(np.floor((origins[r, 2] + depth * directions[r, 2] - low[2]) * inverse))
+            i += 1
+            if a < 0 or b < 0 or c < 0 or a >= row.shape[0] or b >= row.shape[1] or c >= row.shape[2]:
+                continue
+            at = row[a, b, c]
+            if at < 0:
+                # Nothing of the shell within -at - 1 voxels of this one's centre; a diagonal is kept in hand.
+                i += max(0, int((-at - 3) * voxel / step))
+                continue
+            if count == room:
+                room *= 2
+                ray_of, depth_of, row_of = _grown(ray_of, room), _grown(depth_of, room), _grown(row_of, room)
+            ray_of[count], depth_of[count], row_of[count] = r, depth, at
+            count += 1
+    return ray_of[:count], depth_of[:count], row_of[:count]
+
+
+@compiled_part
+def _nearest(x, y, z, around, listed, at, buffer, found, squares):  # noqa: ANN001, ANN202
+    """All vertices listed in a row and their squared distances, nearest first."""
+    dx = minus(fill(x), load(around, 0, 0))
+    dy = minus(fill(y), load(around, 1, 0))
+    dz = minus(fill(z), load(around, 2, 0))
+    square = distinct(times_plus(dx, dx, times_plus(dy, dy, times_plus(dz, dz, fill(_ZERO)))))
+    store(buffer, 0, 0, square)
+    # A vertex comes as many places behind the first as there are nearer ones.
+    place = fill(_ZERO)
+    for j in range(listed.shape[1]):
+        place = one_more_where_less(spread(buffer, 0, j), square, place)
+    store(buffer, 1, 0, place)
+    for j in range(listed.shape[1]):
+        rank = int(buffer[1, j])
+        found[rank], squares[rank] = listed[at, j], buffer[0, j]
+
+
+@compiled_part
+def _weigh(squares, smooth, scale, weights):  # noqa: ANN001, ANN202
+    """Weights of the nearest vertices by their squared distances."""
+    count = weights.shape[0]
+    total = _ZERO
+    share = _ONE / max(squares[count - 1], np.float32(1e-12))
+    for j in range(count):
+        if smooth:
+            part = _ONE - squares[j] * share
+            weights[j] = part * part + np.float32(1e-6)
+        else:
+            weights[j] = np.exp(-min(squares[j] * scale * scale, np.float32(4)))
+        total += weights[j]
+    share = _ONE / total
+    for j in range(count):
+        weights[j] *= share
+
+
+@compiled_part
+def _map(x, y, z, found, weights, forward, buffer, inverse, point, s):  # noqa: ANN001, ANN202
+    """Row `s` of the blended transforms' inverses, [S 12], and of the points that they make of x, y, z."""
+    mixed = scaled(weights[0], load(forward, found[0], 0))
+    for j in range(1, weights.shape[0]):
+        mixed = times_plus(fill(weights[j]), load(forward, found[j], 0), mixed)
+    store(buffer, 2, 0, mixed)
+    a0, a1, a2, a3 = buffer[2, 0], buffer[2, 1], buffer[2, 2], buffer[2, 3]
+    b0, b1, b2, b3 = buffer[2, 4], buffer[2, 5], buffer[2, 6], buffer[2, 7]
+    c0, c1, c2, c3 = buffer[2, 8], buffer[2, 9], buffer[2, 10], buffer[2, 11]
+    i00, i01, i02 = b1 * c2 - b2 * c1, c1 * a2 - c2 * a1, a1 * b2 - a2 * b1
+    i10, i11, i12 = b2 * c0 - b0 * c2, c2 * a0 - c0 * a2, a2 * b0 - a0 * b2
+    i20, i21, i22 = b0 * c1 - b1 * c0, c0 * a1 - c1 * a0, a0 * b1 - a1 * b0
+    scale = _ONE / (a0 * i00 + a1 * i10 + a2 * i20)
+    i00, i01, i02 = i00 * scale, i01 * scale, i02 * scale
+    i10, i11, i12 = i10 * scale, i11 * scale, i12 * scale
+    i20, i21, i22 = i20 * scale, i21 * scale, i22 * scale
+    t0, t1, t2 = -(i00 * a3 + i01 * b3 + i02 * c3), -(i10 * a3 + i11 * b3 + i12 * c3), -(i20 * a3 + i21 * b3 + i22 * c3)
+    inverse[s, 0], inverse[s, 1], inverse[s, 2], inverse[s, 3] = i00, i01, i02, t0
+    inverse[s, 4], inverse[s, 5], inverse[s, 6], inverse[s, 7] = i10, i11, i12, t1
+    inverse[s, 8], inverse[s, 9], inverse[s, 10], inverse[s, 11] = i20, i21, i22, t2
+    point[s, 0] = i00 * x + i01 * y + i02 * z + t0
+    point[s, 1] = i10 * x + i11 * y + i12 * z + t1
+    point[s, 2] = i20 * x + i21 * y + i22 * z + t2
+
+
+@compiled_part
+def _is_closer(x, y, z, square, low, voxel, row, nearest, vertices):  # noqa: ANN001, ANN202
+    """Whether a listed vertex of a shell is closer to a point than the root of `square`."""
+    inverse = np.float32(1 / voxel)
+    a = int(np.floor((x - low[0]) * inverse))
+    b = int(np.floor((y - low[1]) * inverse))
+    c = int(np.floor((z - low[2]) * inverse))
+    if a < 0 or b < 0 or c < 0 or a >= row.shape[0] or b >= row.shape[1] or c >= row.shape[2] or row[a, b, c] < 0:
+        return False
+    at = row[a, b, c]
+    for j in range(nearest.shape[1]):
+        v = nearest[at, j]
+        dx, dy, dz = x - vertices[v, 0], y - vertices[v, 1], z - vertices[v, 2]
+        if dx * dx + dy * dy + dz * dz < square:
+            return True
+    return False
+
+
+@compiled_part
+def _grown(old, room):  # noqa: ANN001, ANN202
+    apart()
+    new = np.empty(room, old.dtype)
+    new[: old.shape[0]] = old
+    return new
