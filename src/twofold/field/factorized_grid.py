@@ -82,7 +82,15 @@ class GridFieldConfig:
 
 
 def points_of(body: PosedBody, joints: Sequence[str]) -> Float[np.ndarray, "n 3"]:
-    """Canonical vertices of the body that follow one of the joints more than any other, metres.
+    r"""Canonical vertices of the body that follow one of the joints more than any other, metres.
+
+    \[ \{ v_i : \operatorname{argmax}_j W_{ij} \in J \} \]
+
+    >>> weights, axes = torch.zeros(2, 24), torch.eye(4).expand(24, 4, 4)
+    >>> weights[0, JOINT_NAMES.index("head")] = weights[1, JOINT_NAMES.index("neck")] = 1
+    >>> at, zeros = torch.tensor([[0.0, 1.7, 0.0], [0.0, 1.5, 0.0]]), torch.zeros(24, 3)
+    >>> points_of(PosedBody(at, at, torch.tensor([[0, 1, 0]]), weights, axes, zeros, zeros), ["head"])
+    array([[0. , 1.7, 0. ]], dtype=float32)
 
     Raises:
         ValueError: no vertex does.

@@ -2,9 +2,12 @@
 
 from typing import cast
 
+from twofold.field.factorized_grid import DETAILED
+
 ABSENT: dict[str, dict[str, object]] = {
     "method": {"late_neighbours": None, "late_from": 100, "normals_by": "posed", "background": "capture"},
     "method.sampler": {"units": "metres", "box": "posed"},
+    "method.field": {"detail_voxels": [], "detail_parts": list(DETAILED)},
     "method.pose": {
         "zero_epochs": 0, "epochs": "moments", "canonical_shape": "refined", "test_shape": "refined",
         "observed_only": False,
@@ -23,7 +26,9 @@ ABSENT: dict[str, dict[str, object]] = {
 }  # fmt: skip
 """By the place in a recipe, what was done before a setting existed. A new recipe stores all of its settings, so a
 default may change and a run still means the same."""
-KINDS = {"method": "FactorizedConfig", "method.sampler": "ErrorBoundedSampler"}
+KINDS = {
+    "method": "FactorizedConfig", "method.sampler": "ErrorBoundedSampler", "method.field": "GridFieldConfig",
+}  # fmt: skip
 """What must be stored at a place, or above it, for its settings to be missing; nothing stands for the first method."""
 
 
