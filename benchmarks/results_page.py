@@ -246,7 +246,9 @@ def _completions(results: dict[str, Any]) -> list[str]:
 
         rows.append(
             (
-                f"seed {result['seed']} ({result['shirt']}, {result['hair']})", str(result["steps"]),
+                f"seed {result['seed']} ({result['shirt']}, {result['hair']})"
+                + (f", `{result['settings']}`" if "settings" in result else ""),
+                str(result["steps"]),
                 f"{100 * result['surface']:.0f} %", pair("unobserved_error", 3), pair("observed_error", 3),
                 f"{pair('front_psnr', 2)} dB",
             )

@@ -48,7 +48,8 @@ class CompletionConfig:
     shape: float = 0.0
     """Weight of the squared difference to the completed distance, centimetres."""
     light: float = 0.0
-    """Weight of what is not linear in the normal in the law of light, for fields that have one."""
+    """Weight of what is not linear in the normal in the law of light, for fields that have one; 0.1 cost 0.2 dB of the
+    training images of a synthetic subject, and gained nothing."""
     points: int = 512
     """Points a step."""
     samples: int = 40_000

@@ -74,9 +74,9 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
     ) -> dict[str, Float[Tensor, ""]]:
         """See `Avatar.losses`; with completion, the law of light of feature grids is kept simple."""
         terms = super().losses(rendering, batch, posed, mode, generator)
-        if self.completion is not None and isinstance(self.field, GridField):
-            weight = self.config.completion.light * self.completion.unobserved
-            terms["completion_light"] = weight * self.field.light_bend()
+        light = self.config.completion.light
+        if self.completion is not None and isinstance(self.field, GridField) and light > 0:
+            terms["completion_light"] = light * self.completion.unobserved * self.field.light_bend()
         return terms
 
     @property

@@ -19,7 +19,7 @@ from twofold.sampling.error_bounded import ErrorBoundedSampler
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.shell_sampler import ShellSampler
 
-COMPLETING = CompletionConfig(color=2.0, shape=0.04, light=0.1)
+COMPLETING = CompletionConfig(color=2.0, shape=0.04)
 """Completion of unobserved regions as `--complete on` asks for it."""
 
 
