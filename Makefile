@@ -19,7 +19,7 @@ export NO_MKDOCS_2_WARNING := true
 help: ## This list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
-demo: $(VENV)/.ready-studio ## Make a person, train an avatar, show it: demo/report.html (a few minutes)
+demo: $(VENV)/.compiled ## Make a person, train an avatar, show it: demo/report.html (a few minutes)
 	$(BIN)/twofold demo --out $(OUT)
 
 test: checks pytest docs ## Everything that has to hold before a change lands
@@ -81,6 +81,18 @@ $(VENV)/.ready-all: pyproject.toml constraints.txt | $(VENV)/.made
 	@echo "Setting up $(VENV) with all tools: downloads some 900 MB, once."
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[studio,prepare,export,viewer,data,test,docs,dev]'
 	@touch $@ $(VENV)/.ready-studio
+
+# Loops are compiled for the processor at hand when they are first called, and kept. A person of a few pixels calls all.
+$(VENV)/.compiled: $(VENV)/.ready-studio
+	@echo "Compiling for this processor: a minute or two, once."
+	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && { \
+		$(BIN)/twofold studio $$folder/person --size 64 --frames 12 --cameras 2 && \
+		$(BIN)/twofold train $$folder/person --out $$folder/run --steps 4 && \
+		$(BIN)/twofold evaluate $$folder/run --max-images 1 --max-meshes 1 && \
+		$(BIN)/twofold export $$folder/run --format glb --faces 2000 && \
+		$(BIN)/twofold render $$folder/run --mesh; \
+	} >$$folder/log 2>&1 || { cat $$folder/log >&2; exit 1; }
+	@touch $@
 
 $(VENV)/.made:
 	@python=; for name in python3.11 python3.12 python3.10 python3 python; do \
