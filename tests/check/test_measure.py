@@ -2,19 +2,17 @@
 
 import json
 import shutil
-from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 import torch
 from filmed import describe, each_mask, move
-from PIL import Image
 
 from twofold.capture.folder import read_capture
 from twofold.capture.validate import validate
-from twofold.check.check_report import numbers, overlay, write_check
-from twofold.check.frame_measures import mirrored_pose, side_of_faces
+from twofold.check.check_report import numbers, write_check
+from twofold.check.frame_measures import mirrored_pose
 from twofold.check.measure import alike, measure_capture, spread
 from twofold.check.rules import judge
 from twofold.cli.main import main
@@ -213,18 +211,8 @@ def test_the_page_stands_alone_and_no_name_breaks_it(turner, tmp_path):
     assert "<script>x</script>" in text
     assert "A & B" in text
     assert "8 of 31 images checked" in text
-    assert len(parsed.fetched) == 9, "eight overlays and the map of the coverage"
-
-
-def test_overlays_tint_left_limbs_orange_and_right_ones_blue(turner_read, turner_shaped, tmp_path):
-    Image.new("RGB", (96, 96)).save(tmp_path / "black.png")
-    frame = replace(turner_read.train[0], image_file=tmp_path / "black.png")
-    image = overlay(frame, turner_shaped, side_of_faces(turner_shaped), (90, 120)).astype(int)
-    assert image.shape == (120, 90, 3)
-    red, blue = (image[..., k] - image[..., 2 - k] for k in (0, 2))
-    # It faces the camera, so its left is at the right.
-    assert np.nonzero(red > 60)[1].mean() > np.nonzero(blue > 60)[1].mean() + 15
-    assert ((image[..., :2].min(-1) > 170) & (image[..., 2] < 150)).sum() > 50
+    assert len(parsed.fetched) == 21, "eight overlays, four frames from three sides, the map of the coverage"
+    assert "the body leans by" in text
 
 
 def test_faults_that_differ_in_their_frame_are_one():

@@ -52,12 +52,24 @@ def cameras(facts, **changes):
     return replace(facts, cameras=tuple(replace(c, **changes) for c in facts.cameras))
 
 
+@pytest.mark.parametrize(
+    ("changes", "topic", "level"),
+    [({"lean": 15.0, "off_balance": 0.25}, "lean", "warning"), ({"floating": 0.4}, "floating", "note")],
+)
+def test_bodies_that_stand_as_nobody_does_are_named(good, changes, topic, level):
+    odd = replace(good, standing=replace(good.standing, **changes))
+    assert topics(odd) - topics(good) == {topic}
+    assert found(odd, topic).level == level
+    # Where the conventions are wrong, that is what there is to say.
+    assert not {topic} & topics(replace(odd, stature=170.0))
+
+
 def test_a_good_capture_is_good(good):
     verdict = judge(good)
     assert verdict.level == "good"
     assert verdict.words.startswith("Good")
-    # The filmed person is small, and nothing of it is still.
-    assert topics(good) <= {"resolution", "novel poses", "poses"}
+    # The filmed person is small, nothing of it is still, and it turns as on a turntable.
+    assert topics(good) <= {"resolution", "novel poses", "poses", "sliding"}
 
 
 CASES = {

@@ -23,6 +23,9 @@ from twofold.prepare.detections import Track, mirrored_landmarks
 from twofold.prepare.fitting.fit import FitConfig, fit
 from twofold.prepare.video.clips import PrepareConfig
 
+LENS = (1.1 * HEIGHT, 1.1 * HEIGHT, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+"""The staged camera's."""
+
 
 def splits_of(out):
     given = json.loads((out / "capture.json").read_text())["splits"]
@@ -204,15 +207,20 @@ def test_a_full_turn_and_a_moving_camera_are_noticed(tmp_path, monkeypatch):
     notes = notes_of(tmp_path / "me")
     assert notes["yaw_degrees"] > 300
     assert 20 < notes["background_moves_pixels"] < 60
-    (warning,) = done.warnings
+    # Both feet are in the air and swing.
+    warning, feet = done.warnings
     assert "the camera does not stand still" in warning
+    assert feet.startswith("Feet slide: ")
+    assert f"{done.standing.sliding:.2f} m/s" in done.standing.sentence()
+    assert notes["standing"]["sliding"] == done.standing.sliding
 
 
 def test_somebody_who_hardly_turns_is_warned(tmp_path, monkeypatch):
     stage = Stage(tmp_path / "clips", 14, turn=1.0)
     stage.is_understood(monkeypatch)
-    (warning,) = stage.prepare(tmp_path / "me").warnings
+    warning, feet = stage.prepare(tmp_path / "me").warnings
     assert "turns through only" in warning
+    assert feet.startswith("Feet slide: ")
     assert notes_of(tmp_path / "me")["yaw_degrees"] == pytest.approx(np.degrees(13 / FPS), abs=5)  # And walks
 
 
@@ -228,7 +236,7 @@ def test_own_masks_and_poses_take_the_place_of_what_is_found(tmp_path, monkeypat
     np.savez(
         poses, poses=motion.full_pose().numpy(), translations=motion.translation.numpy(), betas=motion.betas.numpy()
     )
-    done = stage.prepare(tmp_path / "me", replace(PLAIN, masks=own, poses=poses))
+    done = stage.prepare(tmp_path / "me", replace(PLAIN, masks=own, poses=poses, intrinsics=LENS))
     assert not asked
     assert done.mean("iou") > 0.99
     assert validate(tmp_path / "me") == []

@@ -8,17 +8,16 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int, UInt8
-from PIL import Image, ImageOps
-from scipy import ndimage
+from jaxtyping import Bool
 
-from twofold.body.skeleton import ShapedBody, shape_body
+from twofold.body.skeleton import shape_body
 from twofold.capture.coverage import coverage_of
 from twofold.capture.coverage_map import CAPTION as COVERAGE
 from twofold.capture.coverage_map import coverage_map
-from twofold.capture.types import Capture, Frame, spread
+from twofold.capture.types import Capture, spread
+from twofold.check.body_pictures import overlay, views_of
 from twofold.check.findings import Judgement, counted
-from twofold.check.frame_measures import FrameFacts, look_at, read_bytes, side_of_faces
+from twofold.check.frame_measures import FrameFacts, side_of_faces
 from twofold.check.measure import Facts
 from twofold.check.motion_measures import LIMBS, STILL
 from twofold.errors import TwofoldError
@@ -26,19 +25,14 @@ from twofold.files import json_text, write_together
 from twofold.html.charts import SERIES, Bar, Curve, bars_svg, directions_svg, dots_svg
 from twofold.html.page import KeyMetric, Table, embedded_image, render
 from twofold.prepare.output.acceptance import MIN_IOU
+from twofold.prepare.standing import UPRIGHT
 from twofold.prepare.turning import SEEN, sides_seen
 
 REPORT, NUMBERS = "index.html", "check.json"
 WORST, EVEN = 6, 12
 """Overlays of the images with the lowest IoU, and of some of the others."""
-CELL = (270, 360)
-"""Width and height of an overlay, pixels."""
-TINTS = np.array([(72, 190, 130), (245, 140, 30), (40, 120, 250)], np.float32)
-"""Trunk and head, left limbs, right limbs; told apart by colour-blind eyes, too."""
-IGNORED = np.array((190, 50, 210), np.float32)
-"""Pixels that are ignored."""
-OUTLINE = (255, 255, 70)
-"""Of the mask."""
+VIEWED = 4
+"""Frames that are shown from the side and from above."""
 GOOD_IOU = 0.8
 """What the fits of real people that trained well reach on average."""
 WORDS = {"good": "Good", "usable": "Usable", "not trainable": "Not trainable"}
@@ -77,32 +71,6 @@ def numbers(facts: Facts, judgement: Judgement) -> dict[str, Any]:
         "findings": [dataclasses.asdict(finding) for finding in judgement.findings],
         **{field.name: _plain(getattr(facts, field.name)) for field in dataclasses.fields(facts)},
     }
-
-
-def overlay(
-    frame: Frame, shaped: ShapedBody, sides: Int[np.ndarray, "F"], cell: tuple[int, int] = CELL
-) -> UInt8[np.ndarray, "h w 3"]:
-    """The posed body tinted over the image, left limbs orange and right ones blue, and the mask's outline.
-
-    What is ignored, because an object hides the person there, is purple.
-
-    Args:
-        frame: holds the image.
-        shaped: the person's body.
-        sides: of its faces (`side_of_faces`).
-        cell: width and height of the result, pixels; what the image lacks is dark.
-    """
-    image, mask = read_bytes(frame)
-    look = look_at(frame, shaped, mask, max(cell), cell[0] / cell[1])
-    canvas = look.window.image(image).astype(np.float32)
-    flat = canvas.reshape(-1, 3)
-    pixel = look.hits.pixel.numpy()
-    flat[pixel] = 0.5 * flat[pixel] + 0.5 * TINTS[sides[look.hits.face.numpy()]]
-    canvas = np.where(look.known[..., None], canvas, 0.4 * canvas + 0.6 * IGNORED)
-    edge = look.mask & ~np.asarray(ndimage.binary_erosion(look.mask, border_value=1), dtype=bool)
-    canvas[edge] = OUTLINE
-    stored = Image.fromarray(canvas.round().astype(np.uint8))
-    return np.asarray(ImageOps.pad(stored, cell, color=(18, 20, 24)))
 
 
 def _plain(value: Any) -> Any:
@@ -195,12 +163,31 @@ def _sheets(facts: Facts, capture: Capture) -> list[dict[str, Any]]:
             "low": f.iou < MIN_IOU,
         }
 
+    def viewed(f: FrameFacts) -> list[dict[str, Any]]:
+        views = views_of(frames[f.camera, f.frame_index], shaped, sides, facts.standing.floor)
+        names = {words: f"{f.camera} {f.frame_index}{words}" for words in views}
+        return [{"image": embedded_image(pixels, names[words], "jpeg")} for words, pixels in views.items()]
+
     with torch.inference_mode():
         return [
+            {
+                "heading": "From the side and from above",
+                "words": "No camera shows these. From the side the filming camera stands at the left, and the line is "
+                f"the floor; from above it stands at the bottom. {facts.standing.sentence()}",
+                "overlays": [view for f in _viewed(facts) for view in viewed(f)],
+            },
             {"heading": "Lowest IoU", "overlays": [shown(f) for f in worst]},
             {"heading": "Most ignored, as hidden by held objects", "overlays": [shown(f) for f in hidden]},
             {"heading": "Others, evenly spread", "overlays": [shown(f) for f in even]},
         ]
+
+
+def _viewed(facts: Facts) -> list[FrameFacts]:
+    """Frames to show from the side: evenly spread, and the one that leans most where it was looked at."""
+    if facts.standing.upright < UPRIGHT:
+        return []
+    leaning = [f for f in facts.frames if f.frame_index == facts.standing.leaning_most][:1]
+    return [*spread([f for f in facts.frames if f not in leaning], VIEWED - len(leaning)), *leaning]
 
 
 def _agreement(facts: Facts) -> dict[str, Any]:

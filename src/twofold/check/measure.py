@@ -26,6 +26,7 @@ from twofold.check.image_measures import Background, background_of, sees_a_face,
 from twofold.check.motion_measures import MotionFacts, motion_facts
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import project
+from twofold.prepare.standing import StandingFacts, standing_facts
 
 MAX_LOOKED_AT = 100
 """Images that are looked at unless more are asked for: a tenth of a second each."""
@@ -92,6 +93,7 @@ class Facts:
         frames: the images that were looked at.
         cameras: what they are.
         motion: what it shows.
+        standing: how the body stands in the frames of the splits.
         backgrounds: by camera, of those that train.
         backs: views from behind in which a face was looked for.
         faces: those in which one was found.
@@ -113,6 +115,7 @@ class Facts:
     frames: tuple[FrameFacts, ...]
     cameras: tuple[CameraFacts, ...]
     motion: MotionFacts
+    standing: StandingFacts
     backgrounds: dict[str, Background]
     backs: tuple[tuple[str, int], ...]
     faces: tuple[tuple[str, int], ...]
@@ -176,6 +179,7 @@ def measure_capture(
     by_camera = _grouped(frame for _, frame in chosen)
     training = [name for name in by_camera if any(f.camera_name == name for f in capture.train)]
     backs = spread([frame for _, frame in chosen if shows_its_back(frame, shaped)], BACKS)
+    motion = motion_facts(poses, translations, shaped.joints, capture.splits, capture.fps)
     facts = Facts(
         name=capture.name,
         folder=folder,
@@ -186,7 +190,8 @@ def measure_capture(
         stature=stature(shaped),
         frames=tuple(looked),
         cameras=_cameras(contents, looked, by_camera, shaped),
-        motion=motion_facts(poses, translations, shaped.joints, capture.splits, capture.fps),
+        motion=motion,
+        standing=standing_facts(poses, translations, shaped.joints, capture.fps, motion.frames),
         backgrounds={name: background_of(spread(by_camera[name], BACKGROUNDS)) for name in training[:4]},
         backs=tuple((f.camera_name, f.frame_index) for f in backs),
         faces=tuple((f.camera_name, f.frame_index) for f in backs if sees_a_face(f, shaped)),

@@ -13,6 +13,7 @@ from twofold.check.measure import CameraFacts, Facts, inverted
 from twofold.check.motion_measures import LIMBS, STILL
 from twofold.prepare.detect.background import MOVING
 from twofold.prepare.output.acceptance import MAX_BAD
+from twofold.prepare.standing import UPRIGHT, standing_faults
 from twofold.prepare.turning import SEEN
 
 STATURES, POSSIBLE_STATURES = (1.2, 2.2), (0.5, 3.0)
@@ -42,9 +43,10 @@ BLURRED = 0.45
 """Sharpness relative to the usual one of the same camera."""
 NOT_NOVEL = 15.0
 """A test pose whose joints are all this close to a training pose, degrees, tests memory."""
+STANDING = ("lean", "floating", "sliding")
 FOLLOWS = {
-    "convention": {"distance", "jumps", "jitter", "resolution", "sides unseen", "up", "cropped", "blur"},
-    "scale": {"distance", "jumps", "jitter", "resolution"},
+    "convention": {"distance", "jumps", "jitter", "resolution", "sides unseen", "up", "cropped", "blur", *STANDING},
+    "scale": {"distance", "jumps", "jitter", "resolution", *STANDING},
     "disagreement": {"cropped"},
 }
 """What need not be said beside a fault, because it comes of it."""
@@ -53,6 +55,10 @@ FOLLOWS = {
 def judge(facts: Facts) -> Judgement:
     """Findings about everything that was measured."""
     found = [*agreement(facts), *_scale(facts), *_masks(facts), *_sides_and_poses(facts), *_motion(facts)]
+    found += [
+        Finding("note" if fault.doubtful else "warning", fault.topic, fault.what, fault.advice)
+        for fault in standing_faults(facts.standing)
+    ]
     found += [finding for camera in facts.cameras for finding in _camera(camera)]
     found += [*_backgrounds(facts), *_images(facts)]
     found = _merged(found)
@@ -238,7 +244,7 @@ def _sides_and_poses(facts: Facts) -> Iterator[Finding]:
             "training pose (median)",
             "Metrics will tell how well frames in between are met, not how well new poses are.",
         )
-    if motion.up < 0.5:
+    if motion.up < UPRIGHT:
         yield Finding(
             "note",
             "up",

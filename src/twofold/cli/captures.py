@@ -1,6 +1,7 @@
 """Commands that make captures and check them: `twofold studio`, `prepare`, `check`."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -64,6 +65,7 @@ def prepare(
     drop: str | None = None,
     credit: str = "",
     refine_masks: Literal["auto", "off"] = "auto",
+    landmark_model: Path | None = None,
 ) -> None:
     """Make a capture folder from a video of one person, or from several synchronised ones.
 
@@ -90,8 +92,12 @@ def prepare(
         drop: Frames to leave out of the splits, such as 3,7-9.
         credit: Whom to name when showing the images.
         refine_masks: auto sharpens the estimator's masks by the background where the camera stands still.
+        landmark_model: Your own file of another BlazePose landmark model (.tflite or .task), such as "heavy".
     """
+    from twofold.capture.folder import read_capture
+    from twofold.check.body_pictures import write_fit_picture
     from twofold.prepare.detect.blazepose import mediapipe_estimator
+    from twofold.prepare.detect.landmark_model import read_landmark_model
     from twofold.prepare.detect.people import count_people
     from twofold.prepare.pipeline import prepare as make
     from twofold.prepare.pipeline import read_body
@@ -101,10 +107,17 @@ def prepare(
         fps, max_size, read_intrinsics(intrinsics), calibration, train_camera, held_out, held_objects, credit,
         masks, landmarks, poses, track, smplx, several_people, person, read_frames(drop), refine_masks,
     )  # fmt: skip
+    estimator = partial(
+        mediapipe_estimator, model=None if landmark_model is None else read_landmark_model(landmark_model)
+    )
     with bar("Preparing") as progress:
-        prepared = make(videos, out, read_body(body), mediapipe_estimator, config, progress, count_people)
+        prepared = make(videos, out, read_body(body), estimator, config, progress, count_people)
+    picture = write_fit_picture(read_capture(out), out, prepared.standing.floor)
     for sentence in prepared.warnings:
         console().print(f"Note: {sentence}", soft_wrap=True)
+    if prepared.focal:
+        console().print(prepared.focal, soft_wrap=True)
+    console().print(f"{prepared.standing.sentence()} From the side and from above: {picture}", soft_wrap=True)
     say(f"The capture is in {out}: {prepared.summary()}", f"twofold check {out}")
 
 

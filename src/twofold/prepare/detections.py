@@ -44,7 +44,17 @@ class Observation:
 
 @runtime_checkable
 class Estimator(Protocol):
-    """Finds one person in the images of a clip, which come in order."""
+    """Finds one person in the images of a clip, which come in order.
+
+    Attributes:
+        offsets: how far it usually marks points off a body's joints and skin, in the axes of the T-pose (x to the
+            person's left, y up, z ahead), metres; zeros where that is not known.
+    """
+
+    @property
+    def offsets(self) -> Float[np.ndarray, "33 3"]:
+        """See the class."""
+        ...
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"], seconds: float) -> Observation:
         """The person in the image taken `seconds` after the clip's start (8-bit sRGB)."""

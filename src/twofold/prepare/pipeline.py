@@ -2,10 +2,9 @@
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -27,82 +26,38 @@ from twofold.prepare.detect.mask_refinement import refine_clip
 from twofold.prepare.detect.people import People, people_finder
 from twofold.prepare.detect.scan import Watched, save_picture, watch_clip, with_masks
 from twofold.prepare.detections import Estimator, Track
-from twofold.prepare.fitting.fit import fit
+from twofold.prepare.fitting.fit import fit, stated_focal
 from twofold.prepare.fitting.observations import Evidence
 from twofold.prepare.fitting.parameters import FittedMotion, choose, pose_motion, root_of
+from twofold.prepare.fitting.physics import up_of
 from twofold.prepare.fitting.pose_files import motion_at
 from twofold.prepare.fitting.world_up import stand_upright, up_direction
 from twofold.prepare.given import Finder, Given, chosen_landmarks, chosen_masks, own_lens, read_given, region_finder
 from twofold.prepare.output.acceptance import (
     FARTHER,
     STEADIER,
-    ImageQuality,
     kept_times,
     require_length,
     require_person,
     require_whole,
     warnings_about,
 )
+from twofold.prepare.output.prepared import Prepared
 from twofold.prepare.output.review import Agreement, compare_with_pictures
+from twofold.prepare.standing import standing_facts, standing_faults
 from twofold.prepare.turning import arc, camera_directions
-from twofold.prepare.video.clips import Clip, PrepareConfig, advice, longer, open_clips, rate_of, require_options
+from twofold.prepare.video.clips import (
+    Clip,
+    PrepareConfig,
+    advice,
+    focal_in_words,
+    longer,
+    open_clips,
+    rate_of,
+    require_options,
+)
 
 Progress = Callable[[float, str], None]
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """What came of it.
-
-    Attributes:
-        folder: the capture.
-        kept: frames in the splits.
-        qualities: a record of every image.
-        warnings: sentences for the user.
-        objects: share of the mask that held objects took, of each image that has some and is kept.
-        refined: share of the masks' pixels that refinement changed, of each clip whose masks were refined.
-    """
-
-    folder: Path
-    kept: tuple[int, ...]
-    qualities: tuple[ImageQuality, ...]
-    warnings: tuple[str, ...]
-    objects: tuple[float, ...] = ()
-    refined: tuple[float, ...] = ()
-
-    def summary(self) -> str:
-        """What came of it in a few words."""
-        moments = len({quality.frame_index for quality in self.qualities})
-        return (
-            f"{len(self.kept)} of {moments} frames, silhouette IoU {self.mean('iou'):.2f}, landmarks off by "
-            f"{self.mean('reprojection'):.1f} pixels ({self.mean('reprojection_percent'):.1f} % of the body's height)."
-            f"{self._refined()}{self._objects()}"
-        )
-
-    def _refined(self) -> str:
-        """How much the masks were changed."""
-        if not self.refined:
-            return ""
-        return (
-            f" The masks were compared with the background, and {100 * np.mean(self.refined):.1f} % of their pixels "
-            "changed (--refine-masks off leaves them)."
-        )
-
-    def _objects(self) -> str:
-        """How much of the masks was taken for held objects."""
-        if not self.objects:
-            return ""
-        images = sum(quality.frame_index in set(self.kept) for quality in self.qualities)
-        return (
-            f" Held objects were taken out in {len(self.objects)} of {images} images, at most "
-            f"{100 * max(self.objects):.1f} % and on average {100 * sum(self.objects) / max(images, 1):.1f} % of the "
-            "person's mask; the report of check shows them, --held-objects keep leaves them."
-        )
-
-    def mean(self, what: Literal["iou", "reprojection", "reprojection_percent"]) -> float:
-        """Over the images of the frames that are kept."""
-        kept = set(self.kept)
-        return float(np.mean([getattr(q, what) for q in self.qualities if q.frame_index in kept]))
 
 
 def prepare(
@@ -243,6 +198,7 @@ class _Found:
     swapped: dict[str, list[int]]
     calibrated: bool
     remarks: list[str]
+    focal: str
 
 
 def _fit_all(
@@ -275,15 +231,17 @@ def _fit_all(
     else:
         repairs = [repair_swaps(tracks[0], seconds)]
         tracks = [own[0] or repairs[0].track]
-    evidence = [
-        Evidence(camera, track, seen.masks) for camera, track, seen in zip(cameras, tracks, watched, strict=True)
-    ]
+    # Landmarks of the user's own are off by something else.
+    offsets = [None if one is not None else seen.offsets for one, seen in zip(own, watched, strict=True)]
+    evidence = [Evidence(*parts) for parts in zip(cameras, tracks, [s.masks for s in watched], offsets, strict=True)]
     free = config.intrinsics is None and config.calibration is None
     if given[0].motion is not None:
         motion = motion_at(given[0].motion, watched[0].sources)
     else:
+        # The file's own word on the focal length is worth more than a guess.
+        stated = {"config": stated_focal()} if free and ready[0].info.focal is not None else {}
         motion = fit(
-            body, evidence, fps, free, points_in_space=in_space,
+            body, evidence, fps, free, points_in_space=in_space, **stated,
             progress=lambda done: progress(0.3 + 0.4 * done, "fitting the body"),
         ).settled(body)  # fmt: skip
     scaled = [longer(camera, float(motion.log_focal.exp())) for camera in cameras]
@@ -291,7 +249,8 @@ def _fit_all(
     motion = replace(motion, log_focal=torch.zeros(()))
     watched = [replace(seen, track=track) for seen, track in zip(watched, tracks, strict=True)]
     cameras = {clip.name: camera for clip, camera in zip(ready, scaled, strict=True)}
-    return _Found(motion, cameras, watched, fps, swapped, config.calibration is not None, remarks)
+    focal = focal_in_words(ready[0], config, scaled[0])
+    return _Found(motion, cameras, watched, fps, swapped, config.calibration is not None, remarks, focal)
 
 
 def _judge_all(found: _Found, body: Body, config: PrepareConfig, progress: Progress) -> list[Agreement]:
@@ -342,7 +301,10 @@ def _write(
     roots, center = axis_angle_to_matrix(poses[trained, 0]), cameras[train].center
     yaw = arc(camera_directions(roots, pelvises, center.expand(len(roots), 3))[0])
     moved, width = watched[index].moved, cameras[train].width
+    joints = body.joints + body.joint_basis[..., : len(found.motion.betas)] @ found.motion.betas
+    standing = standing_facts(poses, translations, joints, found.fps, kept)
     warnings = [*found.remarks, *warnings_about(yaw, moved, width, left_out, len(cameras) > 1)]
+    warnings += [f"{fault.what}. {fault.advice}" for fault in standing_faults(standing)]
     objects = {name: a.removed for name, a in zip(cameras, agreed, strict=True)}
     writer.finish(
         name=out.name,
@@ -374,19 +336,21 @@ def _write(
             "seconds": [round(second, 4) for second in watched[0].seconds],
             "yaw_degrees": round(yaw, 1),
             "background_moves_pixels": None if moved is None else round(moved, 1),
+            "standing": asdict(standing),
             "warnings": warnings,
             "quality": [quality.row() for quality in qualities],
         },
     )
     shares = [share for removed in objects.values() for time, share in removed.items() if time in set(kept)]
     refined = tuple(seen.refined for seen in watched if seen.refined is not None)
-    return Prepared(out, tuple(kept), tuple(qualities), tuple(warnings), tuple(shares), refined)
+    return Prepared(out, tuple(kept), tuple(qualities), tuple(warnings), standing, tuple(shares), refined, found.focal)
 
 
 def _upright(found: _Found, body: Body) -> tuple[Tensor, Tensor, Mapping[str, Camera]]:
     motion = found.motion
     poses, betas = motion.full_pose(), motion.betas
-    up = up_direction(poses, found.calibrated)
+    # Where one camera's clip tells the vertical, the fit has found it.
+    up = up_of(motion.slope) if bool(motion.slope.any()) else up_direction(poses, found.calibrated)
     posed = pose_motion(body, motion)
     some = posed.place(choose(body, torch.arange(0, len(body.template), 7)))
     lowest = float(torch.quantile((some @ up).amin(1), 0.1))

@@ -6,8 +6,8 @@ import pytest
 from made_clips import real_clip
 
 from twofold.prepare.detect import blazepose as landmarks
-from twofold.prepare.detect.blazepose import mediapipe_estimator
-from twofold.prepare.detections import LANDMARKS, track_of
+from twofold.prepare.detect.blazepose import blazepose_offsets, mediapipe_estimator
+from twofold.prepare.detections import LANDMARKS, mirrored_landmarks, track_of
 from twofold.prepare.video.frames import Frames
 
 
@@ -143,3 +143,12 @@ def test_a_real_person(capfd):
         column, row = joints[[11, 12, 23, 24]].mean(0).round().astype(int)
         assert covered[row, column]
     assert any(set(np.unique(view.mask)) - {0, 255} for view in seen), "edges are soft"
+
+
+def test_usual_offsets_are_the_same_on_both_sides():
+    offsets = blazepose_offsets()
+    assert offsets.shape == (33, 3)
+    np.testing.assert_allclose(offsets[list(mirrored_landmarks())] * [-1, 1, 1], offsets, atol=1e-7)
+    # Hips are marked closer together, ears far behind.
+    assert offsets[LANDMARKS.index("left_hip"), 0] < -0.005
+    assert offsets[LANDMARKS.index("right_ear"), 2] > 0.03

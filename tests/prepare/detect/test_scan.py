@@ -86,6 +86,8 @@ def test_soft_edges_stay_soft_but_narrow():
 class Finder:
     """Sees a disc that wanders, with a speck beside it; remembers what it was shown."""
 
+    offsets = np.full((33, 3), 0.01, np.float32)
+
     def __init__(self):
         self.shown, self.masks = [], []
 
@@ -144,6 +146,7 @@ def test_images_masks_and_landmarks_are_put_aside(tmp_path):
     assert seen.track.found.tolist() == [True, True, False, True, True, True]
     assert (seen.track.pixels[4] == 5).all()
     assert (seen.track.world[4] == -5).all()
+    assert seen.offsets is finder.offsets
     assert sorted(path.name for path in (tmp_path / "a" / "b").iterdir()) == sorted(
         f"{k:06d}.{ending}" for k in range(6) for ending in ("jpg", "png")
     )

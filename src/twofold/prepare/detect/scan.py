@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 from scipy import ndimage
 
@@ -47,6 +47,7 @@ class Watched:
         repeated: images that show the same as the one before, and are left out.
         overlaps: of each reading of the user's own masks the IoU with the estimator's, NaN where one is missing; empty
             unless there are several readings.
+        offsets: how far the estimator usually marks points off a body's (`Estimator.offsets`), metres.
         refined: share of the masks' pixels that comparing them with the background changed; None where it was not done.
     """
 
@@ -61,6 +62,7 @@ class Watched:
     repeated: int = 0
     overlaps: tuple[tuple[float, ...], ...] = ()
     refined: float | None = None
+    offsets: Float[np.ndarray, "33 3"] | None = None
 
     def at(self, places: Sequence[int]) -> "Watched":
         """Only some of the images, by their places."""
@@ -147,7 +149,7 @@ def watch_clip(
     places, seconds, steps = zip(*sources, strict=True)
     return Watched(
         tuple(images), tuple(masks), track_of(seen), places, seconds, steps, background_motion(views).moved,
-        tuple(sample), repeated, tuple(zip(*overlaps, strict=True)),
+        tuple(sample), repeated, tuple(zip(*overlaps, strict=True)), offsets=estimator.offsets,
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.skeleton import JOINT_NAMES, Body
+from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.geometry.surfaces import vertex_normals
 from twofold.kernels.kdtree import search_tree
 from twofold.prepare.fitting.body_landmarks import BodyPoints
@@ -38,15 +39,15 @@ class PriorWeights:
         turn_acceleration: likewise, radians per second squared.
         smoothness: weight of both, per second.
         shape: weight of the shape coefficients' squares.
-        marks: how far estimators put landmarks off a body's, metres.
+        marks: how far estimators put landmarks off where they usually mark them, metres.
         focal: how far the focal length may be off its guess (standard deviation of its logarithm).
     """
 
     joint_acceleration: float = 15.0
     turn_acceleration: float = 80.0
-    smoothness: float = 5.0
-    shape: float = 0.1
-    marks: float = 0.02
+    smoothness: float = 15.0
+    shape: float = 0.03
+    marks: float = 0.06
     focal: float = 0.15
 
 
@@ -81,6 +82,23 @@ def landmark_term(posed: Posed, points: BodyPoints, motion: FittedMotion, seen: 
     return loss
 
 
+LEAN_BIAS = 0.4
+"""Share of a camera's pitch that the estimator does not see: it takes cameras for more level than they are. Measured on
+images of synthetic subjects (`python -m benchmarks.landmark_offsets`)."""
+
+
+def estimator_tilt(slope: Float[Tensor, "2"]) -> Float[Tensor, "3 3"]:
+    r"""Rotation that corrects the estimator's landmarks in space for the pitch that it does not see.
+
+    \[ R = \exp\big( -0.4 \arctan(s_z) \, [e_x]_\times \big) \]
+
+    >>> estimator_tilt(torch.zeros(2)).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    angle = -LEAN_BIAS * slope[1].atan()
+    return axis_angle_to_matrix(torch.stack([angle, torch.zeros_like(angle), torch.zeros_like(angle)]))
+
+
 _BONES = (
     (11, 13), (13, 15), (12, 14), (14, 16), (23, 25), (25, 27), (24, 26), (26, 28), (11, 12), (23, 24), (11, 23),
     (12, 24), (29, 31), (30, 32), (7, 8), (7, 0), (8, 0),
@@ -96,6 +114,7 @@ def direction_term(posed: Posed, points: BodyPoints, motion: FittedMotion, seen:
     loss = places.new_zeros(())
     for k in range(len(seen.space)):
         other = torch.nn.functional.normalize(seen.space[k][:, end] - seen.space[k][:, start], dim=-1)
+        other = other @ estimator_tilt(motion.slope).T
         weight = seen.space_weight[k][:, end] * seen.space_weight[k][:, start]
         if len(seen.space) == len(seen.weight):
             weight = weight * (seen.weight[k][:, end] * seen.weight[k][:, start]).sqrt()
@@ -104,8 +123,15 @@ def direction_term(posed: Posed, points: BodyPoints, motion: FittedMotion, seen:
     return loss / len(seen.space)
 
 
-def prior(body: Body, posed: Posed, motion: FittedMotion, fps: float, weights: PriorWeights) -> Tensor:
-    """How unlike people's shapes, poses and motion this is."""
+def prior(
+    body: Body,
+    posed: Posed,
+    motion: FittedMotion,
+    fps: float,
+    weights: PriorWeights,
+    offsets: Float[Tensor, "33 3"] | None = None,
+) -> Tensor:
+    """How unlike people's shapes, poses and motion this is; `offsets` are the estimator's usual ones."""
     spread = motion.pose.new_tensor([STIFFNESS[name.split("_")[-1].rstrip("123")] for name in JOINT_NAMES[1:]])
     loss = 0.05 * (motion.pose / spread[:, None]).square().sum((1, 2)).mean()
     loss = loss + 2.0 * _limits(motion.pose).mean()
@@ -120,7 +146,8 @@ def prior(body: Body, posed: Posed, motion: FittedMotion, fps: float, weights: P
         weight = weights.smoothness / fps
         loss = loss + weight * (_gentle(change) + _gentle(turning))
     loss = loss + weights.shape * motion.betas.square().sum()
-    loss = loss + (motion.marks / weights.marks).square().sum() / 3
+    marks = motion.marks if offsets is None else motion.marks - offsets
+    loss = loss + (marks / weights.marks).square().sum() / 3
     return loss + (motion.log_focal / weights.focal).square()
 
 

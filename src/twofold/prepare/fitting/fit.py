@@ -2,7 +2,8 @@
 
 All frames are fitted together, in three stages: the landmarks' directions in space give a first guess; then the body's
 points are moved to where the landmarks are seen; then its outline is moved to the outline of the mask. People move
-smoothly, bend their joints one way only, and have one shape.
+smoothly, bend their joints one way only, and have one shape. Where feet of one camera's clip demonstrably stand still,
+they stand on one level, and the body keeps its balance (see `footing`, `physics`).
 """
 
 from collections.abc import Callable, Sequence
@@ -16,11 +17,20 @@ from torch import Tensor
 from twofold.body.skeleton import Body
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
-from twofold.prepare.fitting.body_landmarks import body_points
+from twofold.prepare.fitting.body_landmarks import BodyPoints, body_points
 from twofold.prepare.fitting.energy import PriorWeights, direction_term, landmark_term, match_rims, outline_term, prior
-from twofold.prepare.fitting.observations import Evidence, begin, gather
+from twofold.prepare.fitting.footing import MAX_WORSE, carrying, standing, tells_the_vertical
+from twofold.prepare.fitting.observations import Evidence, Seen, begin, gather
 from twofold.prepare.fitting.outlines import Outlines, trace_outlines
-from twofold.prepare.fitting.parameters import Chosen, FittedMotion, Posed, choose, pose_motion
+from twofold.prepare.fitting.parameters import Chosen, FittedMotion, Posed, choose, place_joints, pose_motion
+from twofold.prepare.fitting.physics import (
+    PhysicsWeights,
+    Support,
+    believable,
+    physics_term,
+    slope_of,
+    standing_axis,
+)
 
 WARM_UP = 20
 """Steps over which the rate grows to its full size."""
@@ -41,6 +51,7 @@ class FitConfig:
         outline_weight: of the outline against the landmarks.
         direction_weight: of the landmarks' directions in space in the last stages.
         prior: what is known about people.
+        physics: standing and balance, for one camera, which sees no depth.
         rematch: steps after which outline and body are matched anew.
     """
 
@@ -52,7 +63,24 @@ class FitConfig:
     outline_weight: float = 40.0
     direction_weight: float = 0.3
     prior: PriorWeights = PriorWeights()
+    physics: PhysicsWeights = PhysicsWeights()
     rematch: int = 20
+
+
+def several_cameras() -> FitConfig:
+    """Weights where several cameras agree: what they see needs less of what is known before."""
+    return FitConfig(prior=PriorWeights(smoothness=5.0, shape=0.1, marks=0.02))
+
+
+def steadier(config: FitConfig) -> FitConfig:
+    """Weights for somebody who stands: such motion is slow beside the noise of landmarks, outlines tell more."""
+    prior = replace(config.prior, smoothness=3.3 * config.prior.smoothness)
+    return replace(config, landmark=1.33 * config.landmark, outline_weight=1.5 * config.outline_weight, prior=prior)
+
+
+def stated_focal() -> FitConfig:
+    """Weights where the file states its focal length: stabilisation crops some of the view, little is left to find."""
+    return FitConfig(prior=PriorWeights(focal=0.04))
 
 
 _Matched = tuple[int, Outlines, Chosen, Tensor]
@@ -77,7 +105,7 @@ def fit(
         evidence: of each camera, all of the same frames.
         fps: frames per second.
         free_focal: the focal length of the one camera is a guess and is fitted too.
-        config: weights.
+        config: weights; by default `FitConfig()` for one camera, `several_cameras()` for more.
         points_in_space: landmarks triangulated from several cameras, world, metres; NaN where unknown.
         progress: called with the fraction that is done.
 
@@ -88,9 +116,8 @@ def fit(
     # Thousands of small operations: sharing them out costs more than it saves.
     torch.set_num_threads(1)
     try:
-        return _fit(
-            body, evidence, fps, free_focal, config or FitConfig(), points_in_space, progress or (lambda done: None)
-        )
+        config = config or (FitConfig() if len(evidence) == 1 else several_cameras())
+        return _fit(body, evidence, fps, free_focal, config, points_in_space, progress or (lambda done: None))
     finally:
         torch.set_num_threads(threads)
 
@@ -173,34 +200,55 @@ def _fit_window(
     seen = gather(evidence, outlines, points_in_space)
     motion = begin(body, points, seen)
     if known is not None:
-        motion = replace(motion, betas=known.betas, marks=known.marks, log_focal=known.log_focal)
+        motion = replace(motion, betas=known.betas, marks=known.marks, log_focal=known.log_focal, slope=known.slope)
     shared: tuple[str, ...] = () if known is not None else ("betas", "marks")
     if known is None and len(evidence) == 1:
         shared += ("log_distance", "log_focal") if free_focal else ("log_distance",)
     total = sum(config.steps)
 
-    def everything(direction: float, wide: float) -> Callable[[FittedMotion, Posed], Tensor]:
+    def everything(
+        config: FitConfig, direction: float, wide: float, support: Support | None = None
+    ) -> Callable[[FittedMotion, Posed], Tensor]:
         def loss(motion: FittedMotion, posed: Posed) -> Tensor:
             terms = landmark_term(posed, points, motion, seen, config.landmark * wide)
             terms = terms + direction * direction_term(posed, points, motion, seen, config.direction)
-            return terms + prior(body, posed, motion, fps, config.prior)
+            if support is not None:
+                terms = terms + physics_term(body, posed, points, motion, support, fps, config.physics)
+            return terms + prior(body, posed, motion, fps, config.prior, seen.offsets)
 
         return loss
 
     # Directions in space first, so that no limb starts from the wrong side of the image plane.
     few = config.steps[0] // 3
-    motion = _descend(body, motion, ("root", "pose", "translation"), everything(1.0, 4.0), few, config.rate)
+    guess = _descend(body, motion, ("root", "pose", "translation"), everything(config, 1.0, 4.0), few, config.rate)
     progress(few / total)
+
+    def to_landmarks(motion: FittedMotion, changing: tuple[str, ...], support: Support | None = None) -> FittedMotion:
+        for wide in (4.0, 2.0):
+            loss = everything(config, config.direction_weight, wide, support)
+            motion = _descend(body, motion, changing, loss, (config.steps[0] - few) // 2, config.rate)
+        return motion
+
     changing = ("root", "pose", "translation", *shared)
-    for wide in (4.0, 2.0):
-        half = (config.steps[0] - few) // 2
-        motion = _descend(body, motion, changing, everything(config.direction_weight, wide), half, config.rate)
+    motion = to_landmarks(guess, changing)
+    support = _support(body, motion, seen, fps, config, known)
+    if support is not None:
+        # The vertical of a long clip is that of the window which told its shape.
+        upright, start = changing, motion
+        if known is None:
+            axis = standing_axis(place_joints(pose_motion(body, motion), body, motion), support.stands)
+            upright, start = (*changing, "slope"), replace(start, slope=slope_of(axis))
+        floored = to_landmarks(start, upright, support)
+        if _contradicted(body, points, seen, motion, floored, support, config):
+            support = None
+        else:
+            motion, changing, config = floored, upright, steadier(config)
     progress(config.steps[0] / total)
     masks = [(k, o) for k, o in enumerate(outlines) if o is not None]
     rounds = max(1, config.steps[1] // config.rematch) if masks else 0
     count = len(body.template)
     searched, skin = (choose(body, torch.arange(0, count, max(1, count // n))) for n in (4500, 450))
-    base = everything(config.direction_weight, 1.0)
+    base = everything(config, config.direction_weight, 1.0, support)
     for number in range(rounds):
         matched = [(k, o, *match_rims(body, motion, seen, k, o, searched)) for k, o in masks]
         width = config.outline * (1 + 3 * (1 - number / rounds))
@@ -220,6 +268,49 @@ def _fit_window(
     return motion
 
 
+def _support(
+    body: Body, motion: FittedMotion, seen: Seen, fps: float, config: FitConfig, known: FittedMotion | None
+) -> Support | None:
+    """Where the floor is known to hold the body; None where the clip does not tell it, or several cameras do."""
+    vertical_elsewhere = known is not None and not bool(known.slope.any())
+    if len(seen.pixels) > 1 or config.physics.weight == 0 or vertical_elsewhere:
+        return None
+    stands = standing(seen, fps)
+    if not tells_the_vertical(stands, fps):
+        return None
+    joints = place_joints(pose_motion(body, motion), body, motion)
+    return Support(stands, carrying(joints, stands))
+
+
+def _contradicted(
+    body: Body,
+    points: BodyPoints,
+    seen: Seen,
+    free: FittedMotion,
+    floored: FittedMotion,
+    support: Support,
+    config: FitConfig,
+) -> bool:
+    """Whether a floor and balance go against what is seen.
+
+    Args:
+        body: that is fitted.
+        points: its landmarks.
+        seen: landmarks.
+        free: fitted without them.
+        floored: fitted with them.
+        support: where feet stand.
+        config: weights.
+    """
+    with torch.no_grad():
+        posed = [pose_motion(body, motion) for motion in (free, floored)]
+        missed = [
+            float(landmark_term(one, points, motion, seen, 2 * config.landmark))
+            for one, motion in zip(posed, (free, floored), strict=True)
+        ]
+        return missed[1] > (1 + MAX_WORSE) * missed[0] or not believable(body, posed[1], points, floored, support)
+
+
 def _descend(
     body: Body,
     motion: FittedMotion,
@@ -235,7 +326,7 @@ def _descend(
     metre, from where robust terms no longer find back. So the rate starts small.
     """
     free = {name: getattr(motion, name).clone().requires_grad_() for name in changing}
-    pace = {"translation": 0.5, "betas": 2.0, "marks": 0.05, "log_focal": 0.2, "log_distance": 0.3}
+    pace = {"translation": 0.5, "betas": 2.0, "marks": 0.05, "log_focal": 0.2, "log_distance": 0.3, "slope": 0.3}
     groups = [{"params": [value], "lr": rate * pace.get(name, 1.0)} for name, value in free.items()]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     start = [rate * pace.get(name, 1.0) for name in free]

@@ -26,20 +26,26 @@ class Evidence:
         track: landmarks, sides repaired.
         masks: of each frame, as arrays (0..255) or as image files, which keeps the memory of long clips small;
             None where there are none.
+        offsets: how far the estimator usually marks points off a body's (`Estimator.offsets`), metres.
     """
 
     camera: Camera
     track: Track
     masks: Sequence[Mask] | None = None
+    offsets: Float[np.ndarray, "33 3"] | None = None
 
     def __getitem__(self, times: slice) -> "Evidence":
         parts = {name: value[times] for name, value in vars(self.track).items()}
-        return Evidence(self.camera, Track(**parts), None if self.masks is None else self.masks[times])
+        masks = None if self.masks is None else self.masks[times]
+        return Evidence(self.camera, Track(**parts), masks, self.offsets)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Evidence of all cameras as tensors, c cameras and t frames; landmarks in space are each camera's or common."""
+    """Evidence of all cameras as tensors, c cameras and t frames; landmarks in space are each camera's or common.
+
+    Offsets are the estimators' usual ones, mean over the cameras.
+    """
 
     world_to_camera: Float[Tensor, "c 4 4"]
     intrinsics: Float[Tensor, "c 3 3"]
@@ -48,6 +54,7 @@ class Seen:
     space: Float[Tensor, "k t 33 3"]
     space_weight: Float[Tensor, "k t 33"]
     size: Float[Tensor, "c"]
+    offsets: Float[Tensor, "33 3"]
 
 
 def gather(
@@ -68,6 +75,7 @@ def gather(
     # A guess about what is hidden is worth little, but better than nothing.
     weight = torch.where(there, weight.clamp_min(0.02) ** 2, 0)
     found = (weight > 0).any(-1, keepdim=True)
+    offsets = [np.zeros((33, 3)) if e.offsets is None else e.offsets for e in evidence]
     sizes = [_height(e.track) if o is None else o.size for e, o in zip(evidence, outlines, strict=True)]
     return Seen(
         world_to_camera,
@@ -77,6 +85,7 @@ def gather(
         torch.nan_to_num(space),
         in_space.float(),
         torch.tensor(sizes),
+        torch.from_numpy(np.mean(offsets, 0)).float(),
     )
 
 
@@ -101,7 +110,7 @@ def begin(body: Body, points: BodyPoints, seen: Seen) -> FittedMotion:
     moments = len(guess)
     motion = FittedMotion(
         guess=guess, root=torch.zeros(moments, 3), pose=pose.float(), translation=torch.zeros(moments, 3),
-        betas=torch.zeros(body.shape_basis.shape[-1]), marks=torch.zeros(33, 3), log_focal=torch.zeros(()),
+        betas=torch.zeros(body.shape_basis.shape[-1]), marks=seen.offsets, log_focal=torch.zeros(()),
         log_distance=torch.zeros(()),
     )  # fmt: skip
     moved = place_points(pose_motion(body, motion), points, motion)

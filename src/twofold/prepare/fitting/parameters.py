@@ -4,7 +4,7 @@ Poses are relative to SMPL's T-pose. The root's rotation is a small turn on top 
 face the camera stand half a turn away from the camera's axes, where axis-angle vectors jump.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -29,6 +29,7 @@ class FittedMotion:
         marks: by how much the estimator's landmarks lie off the body's, in the carrying joint's frame, metres.
         log_focal: natural logarithm of the factor by which the focal length differs from the first guess.
         log_distance: likewise of the distance from the world's origin, where the one camera of a clip stands.
+        slope: of the vertical against the camera's axes, along x and z; zeros where nothing in the clip tells it.
     """
 
     guess: Float[Tensor, "t 3 3"]
@@ -39,6 +40,7 @@ class FittedMotion:
     marks: Float[Tensor, "33 3"]
     log_focal: Float[Tensor, ""]
     log_distance: Float[Tensor, ""]
+    slope: Float[Tensor, "2"] = field(default_factory=lambda: torch.zeros(2))
 
     def __len__(self) -> int:
         return len(self.root)

@@ -22,13 +22,14 @@ from twofold.prepare.cameras.calibration import (
     size_of_principal_point,
 )
 from twofold.prepare.cameras.calibration_files import read_calibration
+from twofold.prepare.video.focal import FULL_FRAME
 from twofold.prepare.video.frames import ClipInfo, Frames
 
 Choice = Literal["largest", "masks"] | int
 """The largest person of the first image, the one that the user's own masks show, or the N-th from the left."""
 
-FOCAL_GUESS = 1.1
-"""Times the longer side of an image: between a phone's wide lens and a camera's usual one."""
+FOCAL_GUESS = 0.9
+"""Times the longer side of an image: between a phone's main lens (0.75 to 0.85 in video) and a camera's usual one."""
 
 _SAME_RATE = 1.01
 """Rates that differ by less are the same: time stamps are rounded."""
@@ -273,7 +274,7 @@ def _guessed(info: ClipInfo, config: PrepareConfig) -> Camera:
     """
     across, down = info.width / info.full_width, info.height / info.full_height
     if config.intrinsics is None:
-        fx = fy = FOCAL_GUESS * max(info.width, info.height)
+        fx = fy = (info.focal or FOCAL_GUESS) * max(info.width, info.height)
         cx, cy = (info.width - 1) / 2, (info.height - 1) / 2
     else:
         fx, fy, cx, cy = config.intrinsics
@@ -298,6 +299,29 @@ def _smaller(lens: CalibratedCamera, info: ClipInfo) -> CalibratedCamera:
     intrinsics[:2] *= scale[:, None]
     intrinsics[:2, 2] += 0.5 * (scale - 1)
     return replace(lens, intrinsics=intrinsics, height=info.height, width=info.width)
+
+
+def focal_in_words(clip: Clip, config: PrepareConfig, camera: Camera) -> str:
+    """Where the focal length of the one camera comes from, a sentence; empty for calibrated cameras.
+
+    Args:
+        clip: with the camera as it was at first.
+        config: what was given.
+        camera: as it was found.
+    """
+    focal, longest = float(camera.intrinsics[0, 0]), max(clip.info.width, clip.info.height)
+    size = f"{focal:.0f} pixels of images of {clip.info.width} x {clip.info.height}"
+    if config.calibration is not None:
+        return ""
+    if config.intrinsics is not None:
+        return f"The focal length is {size}, as given."
+    if clip.info.focal is not None:
+        stated = f"{clip.info.focal * FULL_FRAME:.0f} mm of a full-frame camera"
+        return f"The focal length is {size}; the file states {stated}, {clip.info.focal * longest:.0f} pixels."
+    return (
+        f"The focal length was estimated as {size}, from a guess of {FOCAL_GUESS * longest:.0f}; distances are as "
+        "uncertain as it is, so give --intrinsics where they are known."
+    )
 
 
 def longer(camera: Camera, factor: float) -> Camera:

@@ -17,6 +17,7 @@ from jaxtyping import Shaped, UInt8
 
 from twofold.errors import TwofoldError
 from twofold.inputs import is_there, require_file, shown_path
+from twofold.prepare.video.focal import focal_of_video
 
 _LONGEST_GAP = 5.0  # Seconds; what is longer is a fault of the file's clock, not a pause.
 _USUAL_RATE = Fraction(25)
@@ -74,6 +75,7 @@ class VideoInfo:
         duration: seconds, about.
         says_duration: the file itself says how long it is.
         remarks: sentences for the user.
+        focal: focal length over the longer side, as the file states it; None where it does not.
     """
 
     width: int
@@ -84,6 +86,7 @@ class VideoInfo:
     duration: float
     says_duration: bool
     remarks: tuple[str, ...]
+    focal: float | None = None
 
 
 def describe_video(path: Path) -> VideoInfo:
@@ -111,10 +114,12 @@ def describe_video(path: Path) -> VideoInfo:
             aspect = Fraction(1)
         sides = round(first.width * aspect), first.height
         seconds = _stated_duration(container, stream)
+        focal = focal_of_video({**container.metadata, **stream.metadata})
     frames, measured = _clock(path)
     rate = _rate(stated, measured, path, remarks)
     width, height = sides[::-1] if turn.transpose else sides
-    return VideoInfo(width, height, turn, rate, frames, seconds or frames / rate, seconds is not None, tuple(remarks))
+    duration = seconds or frames / rate
+    return VideoInfo(width, height, turn, rate, frames, duration, seconds is not None, tuple(remarks), focal)
 
 
 def _rate(stated: Fraction | None, measured: float | None, path: Path, remarks: list[str]) -> float:

@@ -13,6 +13,7 @@ from PIL import Image, ImageOps
 from twofold.errors import TwofoldError
 from twofold.images import load_image, read_header, upright_size
 from twofold.prepare.video.decoding import Converter, VideoInfo, decode, describe_video
+from twofold.prepare.video.focal import focal_of_image
 from twofold.prepare.video.intensity import deep_values, to_8_bits, white_level
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -40,6 +41,7 @@ class ClipInfo:
         names: what the images of a folder are called, without ending; none for a video.
         remarks: a sentence for each thing the user should know.
         white: the value of white in images of a folder (`intensity.white_level`); 255 for a video.
+        focal: focal length over the longer side, as the file (the first of a folder) states it; None where it does not.
     """
 
     width: int
@@ -53,6 +55,7 @@ class ClipInfo:
     names: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     white: float = 255.0
+    focal: float | None = None
 
 
 @dataclass(frozen=True)
@@ -267,7 +270,8 @@ def _look_at(
         small = shrunk(width, height, max_size)
         white, remarks = white_level(files)
         return clip, files, None, ClipInfo(
-            *small, rate, count, count / rate, width, height, count, names, tuple(remarks), white
+            *small, rate, count, count / rate, width, height, count, names, tuple(remarks), white,
+            focal_of_image(files[0]),
         )  # fmt: skip
     video = describe_video(clip)
     if fps is not None and fps > _FASTER * video.fps:
@@ -278,4 +282,5 @@ def _look_at(
     count = max(round(video.frames * rate / video.fps), 1)
     small = shrunk(video.width, video.height, max_size)
     full = video.width, video.height
-    return clip, (), video, ClipInfo(*small, rate, count, count / rate, *full, video.frames, (), video.remarks)
+    info = ClipInfo(*small, rate, count, count / rate, *full, video.frames, remarks=video.remarks, focal=video.focal)
+    return clip, (), video, info
