@@ -233,7 +233,7 @@ def monohuman_fast() -> Recipe:
     """The same equations within reach of two cores: only likely samples, fewer of them, shortened schedules."""
     start = monohuman()
     skeletal = affordable(start.method.skeletal)
-    rates = SkeletalRates(networks=1e-3, volume=1e-5, motion=1e-4, pose=5e-5)
+    rates = SkeletalRates(networks=1e-3, volume=1e-4, motion=1e-4, pose=5e-5)
     method = replace(start.method, skeletal=skeletal, rates=rates, features_every=8)
     pixels = PixelConfig(
         rays=192, subject_share=0.9, surroundings=8, patches=1, patch_size=16, patch_on_subject=0.9,

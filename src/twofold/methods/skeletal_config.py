@@ -69,14 +69,13 @@ class SkeletalConfig:
         require(self.motion_from < self.motion_full, f"motion_from should be below motion_full={self.motion_full}")
 
     def scaled(self, factor: float) -> "SkeletalConfig":
-        """The schedule stretched by a factor."""
+        """The schedule stretched by a factor. The guard stays: earlier, a good avatar may still be unseen."""
         begin = scaled_count(self.motion_from, factor)
         return replace(
             self,
             correct_from=scaled_count(self.correct_from, factor),
             motion_from=begin,
             motion_full=max(scaled_count(self.motion_full, factor), begin + 1),
-            guard_steps=tuple(scaled_count(step, factor) for step in self.guard_steps),
         )
 
 
