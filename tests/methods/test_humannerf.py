@@ -39,11 +39,14 @@ def test_recipe_has_the_authors_numbers():
 
 
 def test_fast_recipe_changes_no_equation():
-    """Numbers of samples, steps and rates differ, and which samples are left out; see docs/methods/humannerf.md."""
+    """Numbers of samples, steps and rates differ, the unit of the density, and which samples are left out.
+
+    See docs/methods/humannerf.md; that a unit changes nothing else, test_skeletal.py shows.
+    """
     first, second = (to_dict(recipe().method.skeletal) for recipe in (humannerf, humannerf_fast))
     assert {name for name in first if first[name] != second[name]} == {
-        "samples", "min_likelihood", "min_weight", "hidden_dtype", "volume_every", "motion_from", "motion_full",
-        "guard_steps", "guard_frames", "guard_size",
+        "samples", "min_likelihood", "min_weight", "hidden_dtype", "volume_every", "density_unit", "motion_from",
+        "motion_full", "guard_steps", "guard_frames", "guard_size",
     }  # fmt: skip
 
 
