@@ -40,6 +40,9 @@ INCOMPLETE = {
     "twofold.field.prefit_cache.cache_file": "names a file of the user's cache",
     "twofold.field.prefit_cache.fitted_distance": "takes minutes",
     "twofold.sampling.placement.placement": "puts together what others found",
+    "twofold.sampling.shell.ray_starts": "`clip_to_box` has it",
+    "twofold.sampling.shell_walk.can_walk": "asks what the arrays are",
+    "twofold.sampling.shell_walk.walk_to_canonical": "`sample_shell`, `placement` and `miswarped` in one walk",
     "twofold.sampling.pruning.miswarped": "needs a posed body and its shells",
     "twofold.sampling.pruning.visible": "`seen_samples` has it",
 }

@@ -6,7 +6,7 @@ import pytest
 import torch
 from test_factorized_grid import BODY, POSE_SIZE, SMALL, make, off_the_start, parameter_gradients
 
-from twofold.field.fused_tile import TILE
+from twofold.field.fused_tile_kernels import TILE
 
 QUADS = replace(SMALL, features=4)
 

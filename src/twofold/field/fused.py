@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from twofold.field import fused_kernels as kernels
-from twofold.field import fused_lookups as lookups
+from twofold.field import fused_lookup_kernels as lookups
 from twofold.field.grids import Lattices
 from twofold.kernels.lanes import QUAD
 from twofold.kernels.parallel import in_parts
@@ -88,7 +88,17 @@ class FusedField:
 
 
 def in_quads(field: FusedField) -> FusedField:
-    """The same field with features of zero added at each node, until they fill whole short vectors."""
+    r"""The same field with features of zero added at each node, until they fill whole short vectors.
+
+    \[ (F, 0) \cdot (w, 0) = F \cdot w \]
+
+    >>> lattices = Lattices(torch.zeros(8, dtype=torch.int32), torch.ones(1, 4), torch.tensor([[2, 2, 2, 0]]))
+    >>> net = (torch.ones(1, 3), torch.zeros(1), torch.ones(1, 1), torch.zeros(1), torch.ones(1, 1), torch.zeros(1))
+    >>> table = torch.ones(1, 3)
+    >>> wide = in_quads(FusedField(table[:, :1], table, table, (lattices,) * 3, (net,) * 4, 0.05))
+    >>> wide.low.shape[1], wide.nets[0][0]
+    (4, tensor([[1., 1., 1., 0.]]))
+    """
     channels = field.low.shape[1]
     missing = -channels % QUAD
     if not missing:

@@ -11,7 +11,7 @@ come in the order low distance, low colour, high distance, high colour. `u` and 
 
 import numpy as np
 
-from twofold.field.fused_layers import (
+from twofold.field.fused_layer_kernels import (
     FRESH,
     MASK,
     MORE,
@@ -27,8 +27,8 @@ from twofold.field.fused_layers import (
     unpadded,
     zeros_like,
 )
-from twofold.field.fused_lookups import pulled
-from twofold.field.fused_tile import (
+from twofold.field.fused_lookup_kernels import pulled
+from twofold.field.fused_tile_kernels import (
     COLORS,
     FEATURES,
     ONE,

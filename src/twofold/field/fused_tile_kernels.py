@@ -1,7 +1,7 @@
 """What is known about a tile of samples of the two-branch grid field; `fused_kernels` has the passes over all samples.
 
 Legend: T samples of a tile, of which the first `count` are real; `grids` are prior, low and high one; `nets` are
-`fused_layers.Net` in the order low distance, low colour, high distance, high colour; `t` is a `Tile`, `u` its
+`fused_layer_kernels.Net` in the order low distance, low colour, high distance, high colour; `t` is a `Tile`, `u` its
 `Cotangents`.
 """
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from twofold.field.fused_layers import (
+from twofold.field.fused_layer_kernels import (
     FRESH,
     MORE,
     PLAIN,
@@ -26,7 +26,7 @@ from twofold.field.fused_layers import (
     take_active,
     upper_layers,
 )
-from twofold.field.fused_lookups import lookup, lookup_prior, lookup_with_slopes, pulled
+from twofold.field.fused_lookup_kernels import lookup, lookup_prior, lookup_with_slopes, pulled
 from twofold.kernels.lanes import LANES, apart
 from twofold.kernels.parallel import compiled_part
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from twofold.field import fused_layers as layers
-from twofold.field import fused_lookups as lookups
+from twofold.field import fused_layer_kernels as layers
+from twofold.field import fused_lookup_kernels as lookups
 from twofold.field.grids import build_lattices, interpolate_in_torch, pullback_in_torch
 from twofold.kernels.parallel import compiled
 
