@@ -13,6 +13,22 @@ STRAIGHTEST = 0.9995
 """Share of its length to which a leg may be stretched: a completely straight knee has no direction to bend."""
 
 
+def knee_bends(positions: Float[Tensor, "T 24 3"]) -> Float[Tensor, "T 2"]:
+    """How far the left and the right knee are bent, degrees; 0 for a straight leg.
+
+    >>> joints = torch.zeros(1, 24, 3)
+    >>> joints[0, 1, 1], joints[0, 7, 2] = 1.0, -1.0  # a thigh that hangs and a shin that points back, on the left
+    >>> knee_bends(joints)[0, 0].item()
+    90.0
+
+    Args:
+        positions: of every joint, metres.
+    """
+    hip, knee, ankle = (positions[:, list(part)] for part in (HIPS, KNEES, ANKLES))
+    cosine = torch.nn.functional.cosine_similarity(knee - hip, ankle - knee, dim=-1)
+    return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
+
+
 def reach(
     rotations: Float[Tensor, "T 24 3 3"], positions: Float[Tensor, "T 24 3"], ankles: Float[Tensor, "T 2 3"]
 ) -> Float[Tensor, "T 24 3 3"]:

@@ -24,6 +24,15 @@ from twofold.kernels.parallel import compiled, compiled_part
 
 
 @compiled_part
+def _corner_rows(rows, base, far_i, far_j):  # noqa: ANN001, ANN202
+    """Table rows of a cell's eight corners, the last axis first."""
+    return (
+        rows[base], rows[base + 1], rows[base + far_j], rows[base + far_j + 1],
+        rows[base + far_i], rows[base + far_i + 1], rows[base + far_i + far_j], rows[base + far_i + far_j + 1],
+    )  # fmt: skip
+
+
+@compiled_part
 def lookup(x, count, grid, out):  # noqa: ANN001, ANN201
     """out[T LC] = trilinear features."""
     apart()
@@ -32,9 +41,7 @@ def lookup(x, count, grid, out):  # noqa: ANN001, ANN201
         for level in range(place.shape[0]):
             base, u, v, w = cell(x[s], place[level], shape[level])
             far_i, far_j = shape[level, 1] * shape[level, 2], shape[level, 2]
-            r0, r1, r2, r3 = rows[base], rows[base + 1], rows[base + far_j], rows[base + far_j + 1]
-            base += far_i
-            r4, r5, r6, r7 = rows[base], rows[base + 1], rows[base + far_j], rows[base + far_j + 1]
+            r0, r1, r2, r3, r4, r5, r6, r7 = _corner_rows(rows, base, far_i, far_j)
             for c in range(0, table.shape[1], QUAD):
                 low = between(
                     v,
@@ -58,9 +65,7 @@ def lookup_with_slopes(x, count, grid, out, slopes):  # noqa: ANN001, ANN201
         for level in range(place.shape[0]):
             base, u, v, w = cell(x[s], place[level], shape[level])
             far_i, far_j = shape[level, 1] * shape[level, 2], shape[level, 2]
-            r0, r1, r2, r3 = rows[base], rows[base + 1], rows[base + far_j], rows[base + far_j + 1]
-            base += far_i
-            r4, r5, r6, r7 = rows[base], rows[base + 1], rows[base + far_j], rows[base + far_j + 1]
+            r0, r1, r2, r3, r4, r5, r6, r7 = _corner_rows(rows, base, far_i, far_j)
             scale = place[level, 3]
             for c in range(0, table.shape[1], QUAD):
                 t0, t2, t4, t6 = load4(table, r0, c), load4(table, r2, c), load4(table, r4, c), load4(table, r6, c)
@@ -89,9 +94,7 @@ def lookup_prior(x, count, grid, out, slopes):  # noqa: ANN001, ANN201
     far_i, far_j, scale = shape[0, 1] * shape[0, 2], shape[0, 2], place[0, 3]
     for s in range(count):
         base, u, v, w = cell(x[s], place[0], shape[0])
-        r0, r1, r2, r3 = rows[base], rows[base + 1], rows[base + far_j], rows[base + far_j + 1]
-        base += far_i
-        r4, r5, r6, r7 = rows[base], rows[base + 1], rows[base + far_j], rows[base + far_j + 1]
+        r0, r1, r2, r3, r4, r5, r6, r7 = _corner_rows(rows, base, far_i, far_j)
         for c in range(table.shape[1]):
             t0, t2, t4, t6 = table[r0, c], table[r2, c], table[r4, c], table[r6, c]
             d0, d2, d4, d6 = table[r1, c] - t0, table[r3, c] - t2, table[r5, c] - t4, table[r7, c] - t6

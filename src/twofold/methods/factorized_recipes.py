@@ -223,11 +223,10 @@ def ablation(name: str, start: Recipe) -> Recipe:
         ValueError: there is no such ablation, or it is named as, or exists only for, the other kind of field.
     """
     losses, field = start.method.losses, start.method.field
-    changes: dict[str, object] = dict(ABLATIONS.get(name, {}))
-    if name in BEYOND:
-        if not has_grids(start):
-            raise ValueError(f"{name!r} exists for feature grids only; {start.name} has networks")
-        changes = dict(BEYOND[name])
+    known = ABLATIONS | BEYOND
+    if name in BEYOND and not has_grids(start):
+        raise ValueError(f"{name!r} exists for feature grids only; {start.name} has networks")
+    changes: dict[str, object] = dict(known.get(name, {}))
     unit = "" if isinstance(field, FactorizedFieldConfig) else "cm"
     if re.fullmatch(rf"\[[\d.]+{unit}(, ?[\d.]+{unit})?\]", name):
         frequencies = [float(number) for number in re.findall(r"[\d.]+", name)]
@@ -237,9 +236,9 @@ def ablation(name: str, start: Recipe) -> Recipe:
                 changes[f"{branch}_voxels"] = (0.02 * frequency, 0.01 * frequency)
             else:
                 changes[f"{branch}_octaves"] = int(frequency)
-    elif name not in ABLATIONS and name not in BEYOND:
+    elif name not in known:
         bands = "[a] and [x,y] in octaves" if not unit else "[a] and [x,y] in centimetres, such as [6cm,1cm]"
-        raise ValueError(f"no ablation {name!r} of {start.name}; there are {', '.join([*ABLATIONS, *BEYOND])}, {bands}")
+        raise ValueError(f"no ablation {name!r} of {start.name}; there are {', '.join(known)}, {bands}")
     field = replace(field, **changes)
     if name in ("wo_s1c1", "wo_s2c2", "wo_common_loss", "wo_comm") or field.branches != "both":
         losses = replace(losses, common=0.0)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from twofold.body.balance import center_of_mass
-from twofold.body.leg_ik import ANKLES, HIPS, KNEES, TOES
+from twofold.body.leg_ik import ANKLES, HIPS, TOES, knee_bends
 from twofold.body.motion import leg_length
 from twofold.body.skeleton import joint_transforms
 
@@ -133,7 +133,7 @@ def standing_facts(
         on_legs=int(carried.sum()),
         off_balance=_median(level[carried]),
         lean=_median(lean[carried]),
-        knees=_median(_knee_bends(placed).amin(1)[carried]),
+        knees=_median(knee_bends(placed).amin(1)[carried]),
         leaning_most=int(times[lean.masked_fill(~carried, -1).argmax()]) if bool(carried.any()) else -1,
         floor=floor,
         floating=float(torch.quantile(lowest, 0.9)) - floor,
@@ -184,12 +184,6 @@ def _on_legs(placed: Float[Tensor, "t 24 3"], joints: Float[Tensor, "24 3"]) -> 
     """Frames whose hips are high above a foot."""
     above = placed[:, list(HIPS), 1].mean(1) - placed[:, list(ANKLES), 1].amin(1)
     return above > ON_LEGS * leg_length(joints)
-
-
-def _knee_bends(placed: Float[Tensor, "t 24 3"]) -> Float[Tensor, "t 2"]:
-    hip, knee, ankle = (placed[:, list(part)] for part in (HIPS, KNEES, ANKLES))
-    cosine = torch.nn.functional.cosine_similarity(knee - hip, ankle - knee, dim=-1)
-    return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
 
 
 def _median(values: Float[Tensor, "n"]) -> float:

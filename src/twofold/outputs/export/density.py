@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from twofold.body.skeleton import PosedBody, pose_body, shape_body
-from twofold.deform.skinning import invert_affine
+from twofold.body.skeleton import skin as skin_points
+from twofold.deform.skinning import inverse_skinning, invert_affine
 from twofold.geometry.cameras import Rays
 from twofold.geometry.rotations import rigid_inverse
 from twofold.geometry.surfaces import vertex_normals
@@ -55,9 +56,8 @@ def rest_skin(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], body: P
     """
     weights = transfer_weights(vertices, faces.cpu().numpy(), replace(body, canonical_vertices=body.vertices))
     home = rigid_inverse(rest.bones)
-    in_rest = _moved(invert_affine(_blended(weights, body.bones @ home)), vertices)
-    canonical = _moved(_blended(weights, home), in_rest)
-    return Skin(in_rest, canonical, faces, weights, rest)
+    in_rest = inverse_skinning(vertices, weights, body.bones @ home)
+    return Skin(in_rest, skin_points(in_rest, weights, home), faces, weights, rest)
 
 
 def pulled_back(avatar: Avatar, posed: PosedAvatar, skin: Skin, branch: str = "full") -> PulledBack:
@@ -79,7 +79,7 @@ def pull_back_posed(avatar: Avatar, posed: PosedAvatar, skin: Skin, branch: str 
         branch: see `Avatar.level`.
     """
     rows = skin.transforms(posed.body)
-    start = _moved(rows, skin.vertices)
+    start = skin.moved(rows)
     normals = vertex_normals(start, skin.faces)
 
     def level(shift: Tensor) -> Tensor:
@@ -134,11 +134,3 @@ def rendered_colors(
         total = color + total if len(total) else color
         weight = opacity + weight if len(weight) else opacity
     return (total / weight.clamp_min(1e-6)[:, None]).clamp(0, 1)
-
-
-def _blended(weights: Float[Tensor, "V 24"], transforms: Float[Tensor, "24 4 4"]) -> Float[Tensor, "V 3 4"]:
-    return (weights @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4))
-
-
-def _moved(rows: Float[Tensor, "V 3 4"], points: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
-    return (rows[..., :3] @ points[..., None])[..., 0] + rows[..., 3]

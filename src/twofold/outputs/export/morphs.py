@@ -67,6 +67,10 @@ class Skin:
         from_rest = body.bones @ rigid_inverse(self.rest.bones)
         return (self.weights @ from_rest[:, :3].flatten(1)).unflatten(-1, (3, 4))
 
+    def moved(self, rows: Float[Tensor, "V 3 4"]) -> Float[Tensor, "V 3"]:
+        """The vertices of the rest pose, each moved by its own transform."""
+        return (rows[..., :3] * self.vertices[:, None]).sum(-1) + rows[..., 3]
+
 
 @torch.no_grad()
 def pull_back(avatar: Avatar, posed: PosedAvatar, skin: Skin, branch: str = "full") -> PulledBack:
@@ -83,7 +87,7 @@ def pull_back(avatar: Avatar, posed: PosedAvatar, skin: Skin, branch: str = "ful
         branch: "full" or "base".
     """
     rows = skin.transforms(posed.body)
-    start = (rows[..., :3] * skin.vertices[:, None]).sum(-1) + rows[..., 3]
+    start = skin.moved(rows)
     normals = vertex_normals(start, skin.faces)
 
     def field_at(shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from twofold.body.skeleton import JOINT_NAMES, PosedBody
-from twofold.deform.skinning import invert_affine, smooth_neighbour_weights
+from twofold.deform.skinning import inverse_skinning, smooth_neighbour_weights
 from twofold.geometry.rotations import rigid_inverse
 from twofold.geometry.surfaces import nearest_vertices
 from twofold.outputs.export.repair import neighbour_means
@@ -100,7 +100,4 @@ def to_rest(vertices: Float[Tensor, "V 3"], weights: Float[Tensor, "V 24"], rest
         weights: their skinning weights.
         rest: the body in the T-pose.
     """
-    to_canonical = rigid_inverse(rest.bones)
-    rows = (weights @ to_canonical[:, :3].flatten(1)).unflatten(-1, (3, 4))
-    inverse = invert_affine(rows)
-    return (inverse[..., :3] @ vertices[..., None])[..., 0] + inverse[..., 3]
+    return inverse_skinning(vertices, weights, rigid_inverse(rest.bones))

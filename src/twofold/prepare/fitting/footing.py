@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from twofold.body.leg_ik import ANKLES, HIPS, KNEES
+from twofold.body.leg_ik import knee_bends
 from twofold.prepare.detections import LANDMARKS
 from twofold.prepare.fitting.observations import Seen
 
@@ -69,10 +69,7 @@ def carrying(joints: Float[Tensor, "t 24 3"], stands: Float[Tensor, "t 2"]) -> F
         joints: positions, metres.
         stands: see `standing`.
     """
-    hip, knee, ankle = (joints[:, list(part)] for part in (HIPS, KNEES, ANKLES))
-    cosine = torch.nn.functional.cosine_similarity(knee - hip, ankle - knee, dim=-1)
-    bend = torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
-    straight = ((FOLDED - bend) / (FOLDED - BENT)).clamp(0, 1)
+    straight = ((FOLDED - knee_bends(joints)) / (FOLDED - BENT)).clamp(0, 1)
     return (stands * straight).amax(1)
 
 

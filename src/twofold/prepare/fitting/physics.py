@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.balance import center_of_mass, center_of_pressure
+from twofold.body.leg_ik import ANKLES
 from twofold.body.skeleton import Body
 from twofold.prepare.fitting.body_landmarks import BodyPoints
 from twofold.prepare.fitting.footing import HEIGHT, MAX_TILT, MAX_UNEVEN, SOLES, floor_of
@@ -172,7 +173,7 @@ def believable(body: Body, posed: Posed, points: BodyPoints, motion: FittedMotio
 
 def standing_axis(joints: Float[Tensor, "t 24 3"], stands: Float[Tensor, "t 2"]) -> Float[Tensor, "3"]:
     """Mean direction from the standing feet to the centre of mass, a unit vector."""
-    feet = (stands[..., None] * joints[:, [7, 8]]).sum(1) / stands.sum(1, keepdim=True).clamp_min(1)
+    feet = (stands[..., None] * joints[:, list(ANKLES)]).sum(1) / stands.sum(1, keepdim=True).clamp_min(1)
     there = stands.amax(1) > 0
     ahead = torch.nn.functional.normalize(center_of_mass(joints)[there] - feet[there], dim=-1)
     return torch.nn.functional.normalize(ahead.mean(0), dim=0)
