@@ -70,8 +70,8 @@ def results_page(results: dict[str, Any]) -> str:
         + _steps(_named(results, "step-")),
         "## Training step of the other methods\n\nThe fast recipe against the form of the authors' program (every "
         "sample shaded, float32, gradients by automatic differentiation): same networks, weights and rays. Seconds of "
-        "the processor on one thread, measured while other programs ran. `python -m benchmarks.method_steps`.\n\n"
-        + _method_steps(results["method-steps-cpu-1threads"]),
+        "the processor on one thread, measured beside other programs, before the fast recipes were last changed. "
+        "`python -m benchmarks.method_steps`.\n\n" + _method_steps(results["method-steps-cpu-1threads"]),
         *_methods(results),
         "## Rendering\n\nSeconds for one image, posing included. `python -m benchmarks.rendering`.\n\n"
         + _rendering(_named(results, "rendering-")),
