@@ -66,15 +66,15 @@ def results_page(results: dict[str, Any]) -> str:
         *_studies(results),
         "## Training step\n\nSame networks, rays and losses. `fast` has the paper's network sizes, the shell sampler, "
         "a hand-written reverse pass and bfloat16 hidden layers; the reference form is the usual one: error-bounded "
-        "sampler, autograd through autograd, dense samples, float32. `python -m benchmarks.step`.\n\n"
-        + _steps(_named(results, "step-")),
+        "sampler, autograd through autograd, dense samples, float32. On the AMD EPYC, before the "
+        "compiled loops were last changed. `python -m benchmarks.step`.\n\n" + _steps(_named(results, "step-")),
         "## Training step of the other methods\n\nThe fast recipe against the form of the authors' program (every "
         "sample shaded, float32, gradients by automatic differentiation): same networks, weights and rays. Seconds of "
         "the processor on one thread, measured beside other programs, before the fast recipes were last changed. "
         "`python -m benchmarks.method_steps`.\n\n" + _method_steps(results["method-steps-cpu-1threads"]),
         *_methods(results),
-        "## Rendering\n\nSeconds for one image, posing included. `python -m benchmarks.rendering`.\n\n"
-        + _rendering(_named(results, "rendering-")),
+        "## Rendering\n\nSeconds for one image, posing included. On the AMD EPYC, before the compiled "
+        "loops were last changed. `python -m benchmarks.rendering`.\n\n" + _rendering(_named(results, "rendering-")),
         "## Quality against time\n\nSynthetic subject, one training camera; PSNR over the subject's box. "
         "`python -m benchmarks.quality`.\n\n" + _quality(_named(results, "quality-")),
         *_completions(_named(results, "completion-", "")),
