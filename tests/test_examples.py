@@ -41,8 +41,11 @@ INCOMPLETE = {
     "twofold.field.prefit_cache.fitted_distance": "takes minutes",
     "twofold.sampling.placement.placement": "puts together what others found",
     "twofold.sampling.shell.ray_starts": "`clip_to_box` has it",
+    "twofold.sampling.shell.listed_on_rays": "`sample_shell` has it",
+    "twofold.sampling.shell.ray_arrays": "arrays alone",
+    "twofold.sampling.shell.shell_arrays": "arrays alone",
     "twofold.sampling.shell_walk.can_walk": "asks what the arrays are",
-    "twofold.sampling.shell_walk.walk_to_canonical": "`sample_shell`, `placement` and `miswarped` in one walk",
+    "twofold.sampling.shell_walk.start_walk": "needs a posed body and its shells",
     "twofold.sampling.pruning.miswarped": "needs a posed body and its shells",
     "twofold.sampling.pruning.visible": "`seen_samples` has it",
 }

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from twofold.methods.factorized_recipes import quick, released
-from twofold.methods.stored import ABSENT, KINDS, completed
+from twofold.methods.stored import ABSENT, completed
 from twofold.methods.table import DROPPED, RENAMES, recipe_from_dict, recipe_to_dict
 from twofold.methods.table import _renamed as renamed
 
@@ -27,21 +27,31 @@ def test_settings_that_a_stored_recipe_lacks_are_what_was_done_before(name):
     read, was = leaves(recipe_to_dict(recipe_from_dict(stored, "here"))), leaves(stored)
     was = {RENAMES.get(key, key): value for key, value in was.items() if key not in DROPPED}
     assert {key: read[key] for key in was} == was, "what was stored stays"
-    table = {f"{place}.{key}": value for place, settings in ABSENT.items() for key, value in settings.items()}
+    # Each has one of the two kinds of sampler and of field.
+    other = {
+        "quick": ("method.sampler:ErrorBoundedSampler",),
+        "released": ("method.sampler:ShellSampler", "method.field:GridFieldConfig"),
+    }[name]
+    table = {
+        f"{place.partition(':')[0]}.{key}": value
+        for place, settings in ABSENT.items()
+        for key, value in settings.items()
+        if place not in other
+    }
     added = {key: read[key] for key in read.keys() - was.keys() - {"method.kind"}}
     assert added == {key: table[key] for key in added}
-    # Each has another kind of sampler and of field than the table is about.
-    other = "method.sampler" if name == "quick" else "method.field"
-    assert table.keys() - added.keys() == {f"{other}.{key}" for key in ABSENT[other]}
+    assert table.keys() == added.keys()
 
 
-def test_quick_of_then_is_quick_of_now_but_for_three_settings():
+def test_quick_of_then_is_quick_of_now_but_for_these_settings():
     stored = json.loads((STORED / "quick.json").read_text())
     read = recipe_from_dict(stored, "here")
     losses = dataclasses.replace(read.method.losses, base_mask=0.3)  # since then the base branch has a mask term
     # Since then corrections leave alone what no camera sees.
     pose = dataclasses.replace(read.method.pose, observed_only=True)
-    method = dataclasses.replace(read.method, losses=losses, pose=pose).completing(on=True)
+    # Since then rays leap through empty space, and steps near the surface are divided.
+    sampler = dataclasses.replace(read.method.sampler, leap=0.7, finest=quick().method.sampler.finest)
+    method = dataclasses.replace(read.method, losses=losses, pose=pose, sampler=sampler).completing(on=True)
     assert dataclasses.replace(read, method=method) == quick()
 
 
@@ -51,10 +61,11 @@ def test_a_recipe_of_now_is_complete():
 
 def test_every_setting_of_the_table_exists_and_the_old_value_is_allowed():
     for place, settings in ABSENT.items():
-        config = quick() if place == "method.field" else released()
-        for name in place.split("."):
+        path, _, kind = place.partition(":")
+        config = quick() if kind in ("GridFieldConfig", "ShellSampler") else released()
+        for name in path.split("."):
             config = getattr(config, name)
-        assert KINDS.get(place, type(config).__name__) == type(config).__name__
+        assert not kind or type(config).__name__ == kind
         assert settings.keys() <= {f.name for f in dataclasses.fields(config)}
         # JSON has lists where a configuration has tuples.
         values = {key: tuple(value) if isinstance(value, list) else value for key, value in settings.items()}

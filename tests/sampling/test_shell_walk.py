@@ -1,4 +1,4 @@
-"""The walk that maps its samples against the same steps one after the other."""
+"""The walk that maps its samples, and looks only at some, against the same steps one after the other."""
 
 from dataclasses import replace
 
@@ -7,9 +7,13 @@ import torch
 from small_recipes import CASES
 
 from twofold.geometry.cameras import pixel_grid, pixel_rays
+from twofold.geometry.surfaces import nearest_vertices
 from twofold.methods.subject import Subject
 from twofold.sampling import shell_sampler
+from twofold.sampling.placement import FieldQuery
+from twofold.sampling.pruning import visible
 from twofold.sampling.shell_sampler import ShellSampler
+from twofold.volume.rendering import composite, composite_weights, laplace_density
 
 
 def found_by(avatar, person, generator, monkeypatch, compiled):
@@ -68,3 +72,112 @@ def test_rays_that_miss_have_no_samples(person):
         placed = avatar._sampler.well_warped(away, avatar.pose(frame.pose, frame.translation).own.surface, None)
     assert len(placed.samples) == 0
     assert placed.x_canonical.shape == (0, 3)
+
+
+class BallField:
+    """The distance to balls around the vertices of the canonical body; counts how many points were asked for."""
+
+    def __init__(self, avatar, radius=0.02):
+        self.avatar, self.radius, self.asked = avatar, radius, 0
+
+    def __call__(self, x):
+        self.asked += len(x)
+        return nearest_vertices(x, self.avatar.canonical_points, 1)[0][:, 0] - self.radius
+
+
+def seen_by(placed, field, beta, rays):
+    """Opacity and mean depth of each ray."""
+    samples = placed.samples
+    with torch.no_grad():
+        weights = composite_weights(laplace_density(field(placed.x_canonical), beta), samples)
+        opacity, depth = composite(weights, torch.stack([torch.ones_like(weights), samples.depth], 1), samples, rays).T
+    return opacity, depth / opacity.clamp_min(1e-6)
+
+
+@pytest.fixture(scope="module")
+def started(person):
+    """An avatar whose field is the body, a frame's surface, rays of all of its pixels."""
+    avatar = CASES["quick"].method.build(Subject.of(person))
+    frame = person.train[1]
+    with torch.no_grad():
+        surface = avatar.pose(frame.pose, frame.translation).own.surface
+    return avatar, surface, pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
+
+
+def walk_of(started, step, seed=3):
+    avatar, surface, rays = started
+    sampler = replace(avatar._sampler.config, step=step)
+    placer = sampler.build(avatar.deformation, avatar.canonical_points, avatar.subject.body.faces)
+    return placer._walk(placer._shell(surface), rays, surface, torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize(("beta", "radius"), [(0.01, 0.02), (0.003, 0.03), (0.05, 0.01)])
+def test_samples_seen_on_the_way_are_the_visible_ones_of_all(started, beta, radius):
+    avatar, _, rays = started
+    walk, beta = walk_of(started, 0.011), torch.tensor(beta)
+    whole, all_asked, asked = walk.whole(), BallField(avatar, radius), BallField(avatar, radius)
+    with torch.no_grad():
+        wanted = whole[visible(whole.samples, whole.x_canonical, len(rays), all_asked, beta, 2e-3)]
+        ours = walk.seen(FieldQuery(asked, beta), 2e-3, share=0.0)
+    mine, theirs = by_place(ours), by_place(wanted)
+    # Light is multiplied in another order, which decides about samples that are just seen or just not.
+    assert len(set(mine) ^ set(theirs)) <= 0.002 * len(theirs)
+    both = sorted(set(mine) & set(theirs))
+    here, there = (torch.tensor([table[key] for key in both]) for table in (mine, theirs))
+    for name in ("nearest", "weights", "x_canonical", "inverse"):
+        torch.testing.assert_close(getattr(ours, name)[here], getattr(wanted, name)[there])
+    assert (ours.samples.ray_index.diff() >= 0).all()
+    assert asked.asked <= all_asked.asked
+
+
+@pytest.mark.parametrize(("beta", "radius"), [(0.002, 0.01), (0.003, 0.02)])
+def test_leaps_pass_over_nothing_that_counts(started, beta, radius):
+    avatar, _, rays = started
+    walk, beta = walk_of(started, 0.011), torch.tensor(beta)
+    fields = [BallField(avatar, radius) for _ in range(2)]
+    with torch.no_grad():
+        every, leaping = (
+            walk.seen(FieldQuery(field, beta), 2e-3, share) for field, share in zip(fields, (0.0, 0.7), strict=True)
+        )
+    (opaque, depth), (leaping_opaque, leaping_depth) = (
+        seen_by(placed, field, beta, len(rays)) for placed, field in zip((every, leaping), fields, strict=True)
+    )
+    assert (opaque - leaping_opaque).abs().max() < 0.01
+    assert (depth - leaping_depth)[opaque > 0.5].abs().max() < 0.002
+    assert fields[1].asked < fields[0].asked
+
+
+def test_steps_near_the_surface_are_divided_down_to_twice_the_scale(started):
+    avatar, _, _ = started
+    walk, field = walk_of(started, 0.012), BallField(avatar)
+    with torch.no_grad():
+        found = {
+            scale: walk.seen(FieldQuery(field, torch.tensor(scale)), 2e-3, 0.7, finest=0.003)
+            for scale in (0.01, 0.003, 0.0005)
+        }
+    for scale, step in ((0.01, 0.012), (0.003, 0.006), (0.0005, 0.003)):
+        assert found[scale].samples.delta.unique().tolist() == pytest.approx([step])
+    fine, coarse = found[0.003], walk.seen(FieldQuery(field, torch.tensor(0.003)), 2e-3, 0.7)
+    # Each lies within half a step of one of the coarse samples, in depth order, and all of these are divided.
+    ray, depth = fine.samples.ray_index, fine.samples.depth
+    same = ray.diff() == 0
+    assert (depth.diff()[same] > 0.0059).all()
+    for r in coarse.samples.ray_index.unique()[::97]:
+        around = coarse.samples.depth[coarse.samples.ray_index == r]
+        gap = (depth[ray == r][:, None] - around).abs().amin(1)
+        torch.testing.assert_close(gap, torch.full_like(gap, 0.003), atol=1e-5, rtol=0)
+    # A finer walk from the same start finds the same surface: the light that comes through agrees.
+    assert 0.9 < len(ray.unique()) / len(coarse.samples.ray_index.unique()) < 1.1
+
+
+def test_a_finer_walk_and_a_divided_one_show_the_same_surface(started):
+    avatar, _, rays = started
+    beta = torch.tensor(0.002)
+    with torch.no_grad():
+        fine = walk_of(started, 0.003).seen(FieldQuery(BallField(avatar), beta), 2e-3, 0.0)
+        divided = walk_of(started, 0.012).seen(FieldQuery(BallField(avatar), beta), 2e-3, 0.7, finest=0.003)
+    (opaque, depth), (divided_opaque, divided_depth) = (
+        seen_by(placed, BallField(avatar), beta, len(rays)) for placed in (fine, divided)
+    )
+    assert (opaque - divided_opaque).abs().mean() < 0.002
+    assert (depth - divided_depth)[opaque > 0.5].abs().quantile(0.95) < 0.002

@@ -169,6 +169,10 @@ class FactorizedField(nn.Module):
             s2 = high.sdf(torch.cat([encoded, *handed], -1), 1)[:, 0]
         return self._shown(s1, s2, s1)
 
+    def sdf_at(self, pose: Float[Tensor, "P"]) -> Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]:
+        """`sdf` at one pose."""
+        return lambda x_canonical: self.sdf(x_canonical, pose)
+
     def distance_and_gradient(
         self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
     ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:

@@ -1,5 +1,6 @@
 """Vid2Avatar's field: one signed distance and one colour network in canonical space, both conditioned on the pose."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -119,6 +120,10 @@ class ImplicitField(nn.Module):
     def sdf(self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> Float[Tensor, "S"]:
         """The distance alone, metres: about a quarter of the cost of `forward`."""
         return self.networks.sdf.at(pose)(self._encoded(x_canonical), 1)[:, 0]
+
+    def sdf_at(self, pose: Float[Tensor, "P"]) -> Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]:
+        """`sdf` at one pose."""
+        return lambda x_canonical: self.sdf(x_canonical, pose)
 
     def distance_and_gradient(
         self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]

@@ -300,12 +300,8 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
 
     def place(self, rays: Rays, posed: Posed, mode: Mode, generator: torch.Generator | None) -> Placement:
         """The samples that `render` shades."""
-
-        def distance(x_canonical: Tensor) -> Tensor:
-            return self.field.sdf(x_canonical, posed.own.condition)
-
         version = (self._steps, *(parameter._version for parameter in self.field.parameters()))
-        query = FieldQuery(distance, self.beta, self._dense, version)
+        query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, self._dense, version)
         placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
         shading = self.config.outliers_in_shading and not mode.training
         return placed if shading else replace(placed, outlier=torch.zeros_like(placed.outlier))

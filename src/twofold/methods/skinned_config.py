@@ -1,7 +1,7 @@
 """Settings of the methods whose field is moved by the body's skinning, and what these derive from a pose."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -95,6 +95,10 @@ class CanonicalField(Protocol):
 
     def sdf(self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"], /) -> Float[Tensor, "S"]:
         """The distance alone, metres."""
+        ...
+
+    def sdf_at(self, pose: Float[Tensor, "P"], /) -> Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]:
+        """`sdf` at one pose without gradients, for many small sets of points between two changes of parameters."""
         ...
 
     def distance_and_gradient(

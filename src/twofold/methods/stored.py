@@ -6,8 +6,9 @@ from twofold.field.factorized_grid import DETAILED
 
 ABSENT: dict[str, dict[str, object]] = {
     "method": {"late_neighbours": None, "late_from": 100, "normals_by": "posed", "background": "capture"},
-    "method.sampler": {"units": "metres", "box": "posed"},
-    "method.field": {"detail_voxels": [], "detail_parts": list(DETAILED)},
+    "method.sampler:ErrorBoundedSampler": {"units": "metres", "box": "posed"},
+    "method.sampler:ShellSampler": {"leap": 0.0, "finest": 0.0},
+    "method.field:GridFieldConfig": {"detail_voxels": [], "detail_parts": list(DETAILED)},
     "method.pose": {
         "zero_epochs": 0, "epochs": "moments", "canonical_shape": "refined", "test_shape": "refined",
         "observed_only": False,
@@ -24,12 +25,10 @@ ABSENT: dict[str, dict[str, object]] = {
         "reachable": "body", "subject": "half", "between": False, "replacement": True, "memory_gb": 1.0,
     },
 }  # fmt: skip
-"""By the place in a recipe, what was done before a setting existed. A new recipe stores all of its settings, so a
-default may change and a run still means the same."""
-KINDS = {
-    "method": "FactorizedConfig", "method.sampler": "ErrorBoundedSampler", "method.field": "GridFieldConfig",
-}  # fmt: skip
-"""What must be stored at a place, or above it, for its settings to be missing; nothing stands for the first method."""
+"""By the place in a recipe, and by what must be stored there, what was done before a setting existed. A new recipe
+stores all of its settings, so a default may change and a run still means the same."""
+METHOD = "FactorizedConfig"
+"""The method whose settings these are; nothing stands for it, too."""
 
 
 def completed(recipe: dict[str, object]) -> dict[str, object]:
@@ -38,19 +37,16 @@ def completed(recipe: dict[str, object]) -> dict[str, object]:
     >>> completed({"training": {"steps": 5}, "method": {"kind": "Another"}})
     {'training': {'epochs': 'images', 'steps': 5}, 'method': {'kind': 'Another'}}
     """
-    for place in ABSENT:
-        recipe = _with(recipe, place.split("."), "", ABSENT[place])
+    for place, settings in ABSENT.items():
+        path, _, kind = place.partition(":")
+        recipe = _with(recipe, path.split("."), kind, settings)
     return recipe
 
 
-def _with(stored: dict[str, object], ahead: list[str], place: str, settings: dict[str, object]) -> dict[str, object]:
-    kind = KINDS.get(place)
-    if kind and stored.get("kind", kind) != kind:
-        return stored
+def _with(stored: dict[str, object], ahead: list[str], kind: str, settings: dict[str, object]) -> dict[str, object]:
     if not ahead:
-        return settings | stored
+        return stored if kind and stored.get("kind", kind) != kind else settings | stored
     within = stored.get(ahead[0])
-    if not isinstance(within, dict):
+    if not isinstance(within, dict) or (ahead[0] == "method" and within.get("kind", METHOD) != METHOD):
         return stored
-    place = f"{place}.{ahead[0]}".lstrip(".")
-    return stored | {ahead[0]: _with(cast(dict[str, object], within), ahead[1:], place, settings)}
+    return stored | {ahead[0]: _with(cast(dict[str, object], within), ahead[1:], kind, settings)}

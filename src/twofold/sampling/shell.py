@@ -5,6 +5,7 @@ of a sample is sought only among the few that its voxel lists, instead of among 
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from twofold.geometry.cameras import Rays, clip_to_box
 from twofold.kernels.kdtree import query_nearest, search_tree
 from twofold.kernels.lanes import LANES
 from twofold.kernels.parallel import in_parts
-from twofold.sampling import shell_kernels, voxel_kernels
+from twofold.sampling import voxel_kernels, walk_kernels
 from twofold.volume.samples import Samples
 
 
@@ -189,9 +190,13 @@ def sample_shell(
     if len(ray_ids) == 0:
         none = torch.zeros(0, device=device)
         return Samples(ray_ids, none, none), ray_ids[:, None].expand(0, k), none[:, None].expand(0, k)
-    find = _walk_in_torch if device.type != "cpu" or rays.origins.dtype != torch.float32 else _walk_compiled
-    ray, depth, nearest, squared = find(shell, clipped, start, step, limit, k)
-    return Samples(ray_ids[ray], depth, torch.full_like(depth, step)), nearest, squared
+    find = _listed_in_torch if device.type != "cpu" or rays.origins.dtype != torch.float32 else _listed_compiled
+    ray, depth, row = find(shell, clipped, start, step)
+    points = clipped.origins[ray] + depth[:, None] * clipped.directions[ray]
+    nearest, squared = nearest_listed(shell, points, row, min(k, shell.nearest.shape[1]))
+    close = squared[:, 0] < limit**2
+    depth = depth[close]
+    return Samples(ray_ids[ray[close]], depth, torch.full_like(depth, step)), nearest[close], squared[close]
 
 
 def ray_starts(
@@ -206,28 +211,36 @@ def ray_starts(
     return clipped[ray_ids], ray_ids, start[ray_ids]
 
 
-def _walk_compiled(
-    shell: Shell, rays: Rays, start: Tensor, step: float, limit: float, k: int = 1
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    arrays = (t.contiguous().numpy() for t in (rays.origins, rays.directions, rays.near, rays.far, start))
-    origins, directions, near, far, first = arrays
-    given = (origins, directions, near, far, first, np.float32(step), shell.low.numpy(), shell.voxel, shell.row.numpy())
-    more = (shell.nearest.numpy(), shell.vertices.numpy(), limit, min(k, shell.nearest.shape[1]))
-    parts = in_parts(len(rays), lambda begin, end: shell_kernels.walk(*given, *more, begin, end), least=64)
-    ray, depth, nearest, squared = (torch.from_numpy(np.concatenate(part)) for part in zip(*parts, strict=True))  # type: ignore[misc]
-    return ray, depth, nearest, squared
+def shell_arrays(shell: Shell) -> tuple[np.ndarray, float, np.ndarray, np.ndarray, np.ndarray]:
+    """A shell on the CPU as compiled loops take it."""
+    low, row, nearest, vertices = (t.numpy() for t in (shell.low, shell.row, shell.nearest, shell.vertices))
+    return low, shell.voxel, row, nearest, vertices
 
 
-def _walk_in_torch(
-    shell: Shell, rays: Rays, start: Tensor, step: float, limit: float, k: int = 1
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The same as `_walk_compiled`, for GPUs and as its slow twin."""
+def ray_arrays(rays: Rays, start: Float[Tensor, "R"], step: float) -> tuple[Any, ...]:
+    """Rays on the CPU, where in a step each begins, and the step, as compiled loops take them."""
+    tensors = (rays.origins, rays.directions, rays.near, rays.far, start)
+    return (*(t.contiguous().numpy() for t in tensors), np.float32(step))
+
+
+def listed_on_rays(arrays: Any, lines: Any, rays: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ray, depth and row of `Shell.nearest` of every step in a listed voxel; see `shell_arrays` and `ray_arrays`."""
+    parts = in_parts(rays, lambda begin, end: walk_kernels.candidates(arrays, lines, begin, end), least=64)
+    return parts[0] if len(parts) == 1 else tuple(np.concatenate(part) for part in zip(*parts, strict=True))  # type: ignore[return-value]
+
+
+def _listed_compiled(shell: Shell, rays: Rays, start: Tensor, step: float) -> tuple[Tensor, Tensor, Tensor]:
+    found = listed_on_rays(shell_arrays(shell), ray_arrays(rays, start, step), len(rays))
+    ray, depth, row = (torch.from_numpy(array) for array in found)
+    return ray, depth, row.long()
+
+
+def _listed_in_torch(shell: Shell, rays: Rays, start: Tensor, step: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The same as `_listed_compiled`, for GPUs and as its slow twin."""
     longest = int(((rays.far - rays.near) / step).max().ceil())
     steps = torch.arange(longest, device=rays.near.device, dtype=rays.near.dtype)
     depth = rays.near[:, None] + step * (steps + start[:, None])
     points = rays.origins[:, None] + depth[..., None] * rays.directions[:, None]
     rows = shell.rows_at(points)
     ray, position = ((rows >= 0) & (depth < rays.far[:, None])).nonzero(as_tuple=True)
-    nearest, squared = nearest_listed(shell, points[ray, position], rows[ray, position], k)
-    close = squared[:, 0] < limit**2
-    return ray[close], depth[ray, position][close], nearest[close], squared[close]
+    return ray, depth[ray, position], rows[ray, position]

@@ -1,5 +1,6 @@
 """The shell sampler: samples near the posed body only, and of these only the ones that can be seen."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,7 @@ from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.pruning import miswarped, visible
 from twofold.sampling.sdf_grid import SdfGrid, tabulate
 from twofold.sampling.shell import Shell, build_shell, sample_shell
-from twofold.sampling.shell_walk import can_walk, walk_to_canonical
+from twofold.sampling.shell_walk import Walk, can_walk, start_walk
 
 _GRID_PAYS = 150_000
 """Samples from which on an SDF grid at 15 mm, of some eighty thousand nodes, is the quicker way."""
@@ -36,6 +37,12 @@ class ShellSampler:
     miswarp_slack: float = 0.0
     """Samples that come closer to the body by more than this when they are mapped to canonical space, metres, are
     mis-warped and discarded; 0 keeps them. Not for a field that starts as a sphere."""
+    leap: float = 0.7
+    """Share of the distance to the surface, where that is too large for a sample to count, that a ray may cross without
+    a look at the samples between; 0 looks at every sample. Used on CPUs."""
+    finest: float = 0.0
+    """Near the surface steps are divided until they are as short as twice the density's scale, down to this, metres; 0
+    leaves them as they are. Used on CPUs."""
     sdf_grid_voxel: float = 0.015
     """Rendering with dense networks: spacing of a grid of signed distances, queried once a pose, that finds most
     samples to be empty or hidden before the networks are queried; metres, 0 queries the networks for every sample."""
@@ -45,10 +52,12 @@ class ShellSampler:
         # The voxels of a body fill half a gigabyte at the smallest edge; a ray crosses it in a thousand steps.
         require_within(
             self, radius=(0.005, 0.5), step=(0.001, 0.5), voxel=(0.005, 0.5), min_weight=(0, 1), miswarp_slack=(0, 0.5),
-            sdf_grid_voxel=(0, 0.5),
+            sdf_grid_voxel=(0, 0.5), leap=(0, 1), finest=(0, 0.5),
         )  # fmt: skip
         if 0 < self.sdf_grid_voxel < 0.004:
             raise ValueError(f"sdf_grid_voxel={self.sdf_grid_voxel:g} should be 0.004 to 0.5, or 0 for no grid")
+        if 0 < self.finest < 5e-4:
+            raise ValueError(f"finest={self.finest:g} should be 0.0005 to 0.5, or 0 to leave steps as they are")
 
     @property
     def reach(self) -> float:
@@ -69,15 +78,18 @@ class ShellSampler:
         self, deformation: Deformation, canonical: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
     ) -> "ShellPlacer":
         """The sampler of one avatar, around its canonical body."""
-        return ShellPlacer(self, deformation, canonical)
+        return ShellPlacer(self, deformation, canonical, faces)
 
 
 class ShellPlacer:
     """See `ShellSampler`. Keeps the canonical shell, and the SDF grid of the last pose."""
 
-    def __init__(self, config: ShellSampler, deformation: Deformation, canonical: Tensor) -> None:
+    def __init__(self, config: ShellSampler, deformation: Deformation, canonical: Tensor, faces: Tensor) -> None:
         """Nothing is built yet."""
         self.config, self.deformation = config, deformation
+        edges = (canonical[faces] - canonical[faces.roll(1, -1)]).norm(dim=-1)
+        # The middle of an equilateral triangle is that far from its corners.
+        self._spacing = float(edges.quantile(0.9)) / math.sqrt(3)
         self._canonical = canonical
         self._canonical_shell: Shell | None = None
         self._last_grid: tuple[PosedSurface, tuple[int, ...], SdfGrid] | None = None
@@ -86,7 +98,10 @@ class ShellPlacer:
         self, rays: Rays, surface: PosedSurface, query: FieldQuery, training: bool, generator: torch.Generator | None
     ) -> Placement:
         """See `twofold.sampling.placement.Sampler`."""
-        placed, least = self.well_warped(rays, surface, generator), self.config.min_weight
+        least, shell = self.config.min_weight, self._shell(surface)
+        if least > 0 and (training or not query.dense) and can_walk(shell, rays):
+            return self._walk(shell, rays, surface, generator).seen(query, least, self.config.leap, self.config.finest)
+        placed = self.well_warped(rays, surface, generator)
         if len(placed.samples) == 0 or least == 0:
             return placed
         grid = None if training else self._grid(len(placed.samples), surface, query)
@@ -97,17 +112,21 @@ class ShellPlacer:
         """`candidates` without those that are mis-warped."""
         slack, shell = self.config.miswarp_slack, self._shell(surface)
         if can_walk(shell, rays):
-            canonical = self.canonical_shell(surface.forward.device) if slack > 0 else shell
-            limit = min(self.config.radius, self.deformation.outlier_distance)
-            return walk_to_canonical(
-                shell, rays, self.config.step, generator, limit, surface.neighbours, self.deformation, surface.forward,
-                canonical, slack,
-            )  # fmt: skip
+            return self._walk(shell, rays, surface, generator).whole()
         placed = self.candidates(rays, surface, generator)
         if slack == 0 or len(placed.samples) == 0:
             return placed
         stray = miswarped(placed, rays, surface, self.canonical_shell(surface.forward.device), slack)
         return placed[(~stray).nonzero()[:, 0]]
+
+    def _walk(self, shell: Shell, rays: Rays, surface: PosedSurface, generator: torch.Generator | None) -> Walk:
+        slack = self.config.miswarp_slack
+        canonical = self.canonical_shell(surface.forward.device) if slack > 0 else shell
+        limit = min(self.config.radius, self.deformation.outlier_distance)
+        return start_walk(
+            shell, rays, self.config.step, generator, limit, surface.neighbours, self.deformation, surface.forward,
+            canonical, slack, self._spacing,
+        )  # fmt: skip
 
     @torch.no_grad()
     def candidates(self, rays: Rays, surface: PosedSurface, generator: torch.Generator | None) -> Placement:

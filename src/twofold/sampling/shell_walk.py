@@ -1,4 +1,8 @@
-"""Samples in a shell with their way to canonical space, found in one compiled walk on CPUs."""
+"""Samples in a shell with their way to canonical space, found in compiled loops on CPUs."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,24 +12,145 @@ from torch import Tensor
 from twofold.geometry.cameras import Rays
 from twofold.kernels.lanes import LANES
 from twofold.kernels.parallel import in_parts
-from twofold.sampling import walk_kernels
-from twofold.sampling.placement import Deformation, Placement
-from twofold.sampling.shell import Shell, ray_starts
+from twofold.sampling import visibility_kernels, walk_kernels
+from twofold.sampling.placement import Deformation, FieldQuery, Placement
+from twofold.sampling.shell import Shell, listed_on_rays, ray_arrays, ray_starts, shell_arrays
 from twofold.volume.samples import Samples
+
+_PATIENCE = 3
+"""Rounds after which the few rays that are left look at one more candidate in each round."""
+_Leap = tuple[float, np.ndarray, np.ndarray]
+"""Share of the distance to the surface that a ray leaps over; each ray's next candidate, and where these end."""
+_GOOD = 6
+"""Arrays that describe the samples in what `walk_kernels.map_candidates` returns; the others are of those left out."""
 
 
 def can_walk(shell: Shell, rays: Rays) -> bool:
-    """Whether `walk_to_canonical` can be used: single precision on a CPU, lists that fit into a vector."""
+    """Whether a `Walk` is possible: single precision on a CPU, lists that fit into a vector."""
     own = (rays.origins, rays.directions, shell.vertices)
     return shell.nearest.shape[1] <= LANES and all(t.dtype == torch.float32 and not t.is_cuda for t in own)
 
 
+@dataclass(frozen=True)
+class Walk:
+    """Where rays run through a shell, and what maps its points to canonical space.
+
+    Attributes:
+        ray_ids: which rays meet the shell's box.
+        step: distance between samples, metres.
+        k: how many nearest vertices count.
+        on_rays: number (among `ray_ids`), depth and row of the shell's lists of every candidate, ray by ray.
+        given: what `walk_kernels.map_candidates` takes before these.
+        spacing: how far the body's surface may be from the nearest of its vertices, metres.
+    """
+
+    ray_ids: Tensor
+    step: float
+    on_rays: tuple[np.ndarray, np.ndarray, np.ndarray]
+    given: Any
+    spacing: float = 0.0
+
+    @torch.no_grad()
+    def whole(self) -> Placement:
+        """What `sample_shell`, `placement` and `miswarped` find one after the other: all samples."""
+        return self._placement(*self._mapped(np.arange(len(self.on_rays[0])))[:_GOOD])
+
+    @torch.no_grad()
+    def seen(self, query: FieldQuery, least: float, share: float, finest: float = 0.0) -> Placement:
+        r"""The samples of `whole` that `visible` would choose, found without a look at most others.
+
+        Rays are followed from front to back, a few samples at a time, and no further once less than `least` of their
+        light comes through. A sample at the distance $s$ from the surface has a weight of at most
+
+        \[ w \le \delta \, \sigma(s) = \frac{\delta}{2 \beta} e^{-s / \beta}, \]
+
+        which is below $w_{\min}$ beyond $g = \beta \ln(\delta / (2 \beta w_{\min}))$. So from a sample at the distance
+        $s > g$ the ray leaps over $a \, (s - g)$ metres.
+
+        Args:
+            query: of the field.
+            least: smallest weight that counts, $w_{\min}$.
+            share: $a$; 0 looks at every sample. The distance grows by a metre a metre, but inverse skinning stretches
+                space, so less than one.
+            finest: the steps of the samples found are divided until these are at most $2 \beta$ long, or this, metres;
+                0 leaves them.
+        """
+        coarse = self._search(query, least, share)
+        parts = math.ceil(self.step / max(2 * float(query.beta), finest) - 1e-6) if finest else 1
+        if parts <= 1 or len(coarse[0]) == 0:
+            return self._placement(*coarse)
+        shell, rays = self.given[0], self.given[1]
+        on_rays = walk_kernels.divide(shell, rays, self.on_rays, coarse[0], parts)
+        return Walk(self.ray_ids, self.step / parts, on_rays, self.given, self.spacing)._seen_of_all(query, least)
+
+    def _seen_of_all(self, query: FieldQuery, least: float) -> Placement:
+        """`seen`, of which every sample is looked at, in one go."""
+        found = self._mapped(np.arange(len(self.on_rays[0])))[:_GOOD]
+        through = np.ones(len(self.ray_ids), np.float32)
+        seen = self._follow(found, query, least, through, None)
+        return self._placement(*(array[seen] for array in found))
+
+    def _search(self, query: FieldQuery, least: float, share: float) -> list[np.ndarray]:
+        """What `_mapped` says of the samples that `seen` looks for, in steps of the walk."""
+        ray_at = self.on_rays[0]
+        bounds = np.searchsorted(ray_at, np.arange(len(self.ray_ids) + 1))
+        place, ends = bounds[:-1].copy(), bounds[1:]
+        through = np.ones(len(place), np.float32)
+        index, limit = np.empty(len(ray_at), np.int64), np.float32(least)
+        kept, rounds = list[list[np.ndarray]](), 0
+        while count := visibility_kernels.next_on_rays(place, ends, through, limit, 1 + rounds // _PATIENCE, index):
+            rounds += 1
+            *found, too_far, excess = self._mapped(index[:count])
+            if share > 0 and len(too_far):
+                visibility_kernels.leap_to_shell(too_far, excess, *self.on_rays[:2], place, ends)
+            if len(found[0]):
+                seen = self._follow(found, query, least, through, (share, place, ends))
+                kept.append([array[seen] for array in found])
+        if not kept:
+            return self._mapped(index[:0])[:_GOOD]
+        found = [np.concatenate(part) for part in zip(*kept, strict=True)]
+        order = np.argsort(found[0])
+        return [array[order] for array in found]
+
+    def _follow(
+        self, found: list[np.ndarray], query: FieldQuery, least: float, through: np.ndarray, leap: _Leap | None
+    ) -> np.ndarray:
+        """Which of these candidates add more than `least`; the light left on each ray is reduced by all of them."""
+        number, away = found[0], np.sqrt(np.maximum(found[_GOOD - 1] ** 2 - np.float32(self.spacing**2), 0))
+        beta, seen, none = float(query.beta), np.empty(len(number), bool), np.zeros(0, np.int64)
+        sdf = query.distance(torch.from_numpy(found[3])).float().contiguous().numpy()
+        guard = max(beta * math.log(self.step / (2 * beta * least)), 0.0)
+        share, place, ends = leap or (0.0, none, none)
+        light = np.float32(beta), np.float32(self.step), through, np.float32(least), seen
+        leaping = np.float32(share), np.float32(guard), place, ends
+        visibility_kernels.follow_to_surface(number, *self.on_rays[:2], sdf, away, *light, *leaping)
+        return seen
+
+    def _mapped(self, index: np.ndarray) -> list[np.ndarray]:
+        """What `walk_kernels.map_candidates` says of these."""
+        given = (*self.given, self.on_rays, index)
+        parts = in_parts(len(index), lambda begin, end: walk_kernels.map_candidates(*given, begin, end))
+        return list(parts[0]) if len(parts) == 1 else [np.concatenate(part) for part in zip(*parts, strict=True)]
+
+    def _placement(
+        self, number: np.ndarray, vertex: np.ndarray, weight: np.ndarray, point: np.ndarray, inverse: np.ndarray,
+        _away: np.ndarray,
+    ) -> Placement:  # fmt: skip
+        depth = torch.from_numpy(self.on_rays[1][number])
+        samples = Samples(
+            self.ray_ids[torch.from_numpy(self.on_rays[0][number])], depth, torch.full_like(depth, self.step)
+        )
+        arrays = (torch.from_numpy(vertex), torch.from_numpy(weight), torch.zeros(len(depth), dtype=torch.bool))
+        return Placement(samples, *arrays, torch.from_numpy(point), torch.from_numpy(inverse).unflatten(1, (3, 4)))
+
+
 @torch.no_grad()
-def walk_to_canonical(
+def start_walk(
     shell: Shell, rays: Rays, step: float, generator: torch.Generator | None, limit: float, k: int,
     deformation: Deformation, forward: Float[Tensor, "V 3 4"], canonical: Shell, slack: float,
-) -> Placement:  # fmt: skip
-    """What `sample_shell`, `placement` and `miswarped` find one after the other.
+    spacing: float = 0.0,
+) -> Walk:  # fmt: skip
+    """Finds where rays run through a shell.
 
     Args:
         shell: where to sample.
@@ -38,24 +163,14 @@ def walk_to_canonical(
         forward: canonical-to-posed transforms of the vertices.
         canonical: the shell of the canonical body, which mis-warped samples come too close to.
         slack: by more than this, metres; 0 keeps all.
+        spacing: how far the body's surface may be from the nearest of its vertices, metres.
     """
     clipped, ray_ids, start = ray_starts(shell, rays, generator)
-    k = min(k, shell.nearest.shape[1])
-    lines = (clipped.origins, clipped.directions, clipped.near, clipped.far, start)
-    rows = torch.nn.functional.pad(forward.detach().flatten(1), (0, LANES - 12))
+    own, lines = shell_arrays(shell), ray_arrays(clipped, start, step)
+    rows = torch.nn.functional.pad(forward.detach().flatten(1), (0, LANES - 12)).numpy()
+    smooth, scale = deformation.falloff == "smooth", deformation.scale if deformation.falloff == "scene" else 1
     given = (
-        _arrays(shell), (*(t.contiguous().numpy() for t in lines), np.float32(step)), _arrays(canonical),
-        np.float32(limit), np.float32(slack), deformation.falloff == "smooth",
-        np.float32(deformation.scale if deformation.falloff == "scene" else 1), rows.numpy(), k,
+        own, lines, shell_arrays(canonical), np.float32(limit), np.float32(slack), smooth, np.float32(scale), rows,
+        min(k, shell.nearest.shape[1]),
     )  # fmt: skip
-    parts = in_parts(len(ray_ids), lambda begin, end: walk_kernels.walk_to_canonical(*given, begin, end), least=64)
-    whole = parts[0] if len(parts) == 1 else [np.concatenate(part) for part in zip(*parts, strict=True)]
-    ray, depth, nearest, weights, point, inverse = (torch.from_numpy(array) for array in whole)
-    samples = Samples(ray_ids[ray], depth, torch.full_like(depth, step))
-    outlier = torch.zeros(len(depth), dtype=torch.bool)
-    return Placement(samples, nearest, weights, outlier, point, inverse.unflatten(1, (3, 4)))
-
-
-def _arrays(shell: Shell) -> tuple[np.ndarray, float, np.ndarray, np.ndarray, np.ndarray]:
-    low, row, nearest, vertices = (t.numpy() for t in (shell.low, shell.row, shell.nearest, shell.vertices))
-    return low, shell.voxel, row, nearest, vertices
+    return Walk(ray_ids, step, listed_on_rays(own, lines, len(ray_ids)), given, spacing)

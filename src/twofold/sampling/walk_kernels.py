@@ -1,7 +1,7 @@
 """Rays walked through a shell, each sample mapped to canonical space on the way; `shell_walk` has the arrays.
 
-One look at a sample's candidates gives its nearest vertices, their weights, its canonical position, and whether it is
-mis-warped. `shell_kernels`, `skinning_kernels` and `pruning` do the same one after the other.
+One look at the vertices that a sample's voxel lists gives its nearest ones, their weights, its canonical position, and
+whether it is mis-warped. `shell`, `skinning_kernels` and `pruning` do the same one after the other.
 """
 
 # pyright: reportMissingParameterType=false
@@ -28,65 +28,17 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 @compiled
-def walk_to_canonical(shell, rays, canonical, limit, slack, smooth, scale, forward, k, begin, end):  # noqa: ANN001, ANN201
-    """Samples of rays begin..end within `limit` metres of their nearest listed vertex, mis-warped ones left out.
+def candidates(shell, rays, begin, end):  # noqa: ANN001, ANN201
+    """Ray, depth and row of the shell's lists for every step of rays begin..end that lies in a listed voxel.
 
     Args:
-        shell: (low, voxel, row, nearest, vertices) of a `Shell` with at most 16 candidates a voxel.
-        rays: (origins, directions, near, far, start, step); see `shell_kernels.walk`.
-        canonical: the shell of the canonical body.
-        limit: metres.
-        slack: a sample that comes closer to the canonical body by more than this is mis-warped, metres; 0 keeps all.
-        smooth: weights are those of `smooth_neighbour_weights`, else of `neighbour_weights`.
-        scale: scene units per metre for the latter.
-        forward: canonical-to-posed transform of each vertex, [V 16], row by row, the last four numbers zero.
-        k: how many nearest vertices blend.
+        shell: (low, voxel, row, nearest, vertices) of a `Shell`.
+        rays: (origins, directions, near, far, start, step): a ray's steps begin at its near end, shifted by the part
+            `start` of a step.
         begin: first ray.
         end: ray behind the last.
-
-    Returns:
-        ray, depth, k nearest vertices and their weights, canonical point, and inverse transform [S 12] of each sample.
     """
-    low, voxel, row, nearest, vertices = shell
-    other_low, other_voxel, other_row, other_nearest, other_vertices = canonical
-    ray_at, depth_at, row_at = _follow(rays, low, voxel, row, begin, end)
-    room = row_at.shape[0]
-    ray_of, depth_of = np.empty(room, np.int64), np.empty(room, np.float32)
-    vertex_of, weight_of = np.empty((room, k), np.int64), np.empty((room, k), np.float32)
-    point_of, inverse_of = np.empty((room, 3), np.float32), np.empty((room, 12), np.float32)
-    found, squares, weights = np.zeros(LANES, np.int64), np.full(LANES, _FAR, np.float32), np.empty(k, np.float32)
-    around, buffer = np.full((3, LANES), _FAR, np.float32), np.empty((3, LANES), np.float32)
-    origins, directions = rays[0], rays[1]
-    count = 0
-    # Hardly any branch depends on the data, so the processor fetches the next samples' lists beforehand.
-    for i in range(room):
-        r, depth, at = ray_at[i], depth_at[i], row_at[i]
-        x = origins[r, 0] + depth * directions[r, 0]
-        y = origins[r, 1] + depth * directions[r, 1]
-        z = origins[r, 2] + depth * directions[r, 2]
-        for j in range(nearest.shape[1]):
-            v = nearest[at, j]
-            around[0, j], around[1, j], around[2, j] = vertices[v, 0], vertices[v, 1], vertices[v, 2]
-        _nearest(x, y, z, around, nearest, at, buffer, found, squares)
-        _weigh(squares, smooth, scale, weights)
-        _map(x, y, z, found, weights, forward, buffer, inverse_of, point_of, count)
-        ray_of[count], depth_of[count] = r, depth
-        for j in range(k):
-            vertex_of[count, j], weight_of[count, j] = found[j], weights[j]
-        kept = squares[0] < limit * limit
-        away = np.sqrt(squares[0]) - slack
-        if kept and slack > 0 and away > 0:
-            kept = not _is_closer(
-                point_of[count, 0], point_of[count, 1], point_of[count, 2], away * away,
-                other_low, other_voxel, other_row, other_nearest, other_vertices,
-            )  # fmt: skip
-        count += int(kept)
-    return ray_of[:count], depth_of[:count], vertex_of[:count], weight_of[:count], point_of[:count], inverse_of[:count]
-
-
-@compiled_part
-def _follow(rays, low, voxel, row, begin, end):  # noqa: ANN001, ANN202
-    """Ray, depth and row of every sample in a listed voxel."""
+    low, voxel, row = shell[0], shell[1], shell[2]
     origins, directions, near, far, start, step = rays
     room = (end - begin) * 24 + 64
     ray_of, depth_of, row_of = np.empty(room, np.int64), np.empty(room, np.float32), np.empty(room, np.int32)
@@ -99,13 +51,9 @@ def _follow(rays, low, voxel, row, begin, end):  # noqa: ANN001, ANN202
             depth = np.float32(near[r] + step * (i + start[r]))
             if depth >= far[r]:
                 break
-            a = int(np.floor((origins[r, 0] + depth * directions[r, 0] - low[0]) * inverse))
-            b = int(np.floor((origins[r, 1] + depth * directions[r, 1] - low[1]) * inverse))
-            c = int(np.floor((origins[r, 2] + depth * directions[r, 2] - low[2]) * inverse))
+            x, y, z = _on_ray(origins[r], directions[r], depth)
+            at = _row_at(x, y, z, low, inverse, row)
             i += 1
-            if a < 0 or b < 0 or c < 0 or a >= row.shape[0] or b >= row.shape[1] or c >= row.shape[2]:
-                continue
-            at = row[a, b, c]
             if at < 0:
                 # Nothing of the shell within -at - 1 voxels of this one's centre; a diagonal is kept in hand.
                 i += max(0, int((-at - 3) * voxel / step))
@@ -116,6 +64,117 @@ def _follow(rays, low, voxel, row, begin, end):  # noqa: ANN001, ANN202
             ray_of[count], depth_of[count], row_of[count] = r, depth, at
             count += 1
     return ray_of[:count], depth_of[:count], row_of[:count]
+
+
+@compiled
+def divide(shell, rays, on_rays, chosen, parts):  # noqa: ANN001, ANN201
+    """`parts` candidates evenly spread over the step of each of the `chosen` ones; arrays as in `candidates`."""
+    low, voxel, row = shell[0], shell[1], shell[2]
+    origins, directions, near, far, _, step = rays
+    ray_at, depth_at, _ = on_rays
+    room = chosen.shape[0] * parts
+    ray_of, depth_of, row_of = np.empty(room, np.int64), np.empty(room, np.float32), np.empty(room, np.int32)
+    count = 0
+    inverse = np.float32(1 / voxel)
+    for s in chosen:
+        r = ray_at[s]
+        for part in range(parts):
+            depth = np.float32(depth_at[s] + step * ((part + 0.5) / parts - 0.5))
+            if depth < near[r] or depth >= far[r]:
+                continue
+            x, y, z = _on_ray(origins[r], directions[r], depth)
+            at = _row_at(x, y, z, low, inverse, row)
+            if at >= 0:
+                ray_of[count], depth_of[count], row_of[count] = r, depth, at
+                count += 1
+    return ray_of[:count], depth_of[:count], row_of[:count]
+
+
+@compiled
+def map_candidates(  # noqa: ANN201
+    shell, rays, canonical, limit, slack, smooth, scale, forward, k, found_on_rays, index, begin, end  # noqa: ANN001
+):  # fmt: skip
+    """Maps candidates to canonical space; those too far from the body and the mis-warped ones are left out.
+
+    Args:
+        shell: (low, voxel, row, nearest, vertices) of a `Shell` with at most 16 candidates a voxel.
+        rays: see `candidates`.
+        canonical: the shell of the canonical body.
+        limit: largest distance to the nearest listed vertex, metres.
+        slack: a sample that comes closer to the canonical body by more than this is mis-warped, metres; 0 keeps all.
+        smooth: weights are those of `smooth_neighbour_weights`, else of `neighbour_weights`.
+        scale: scene units per metre for the latter.
+        forward: canonical-to-posed transform of each vertex, [V 16], row by row, the last four numbers zero.
+        k: how many nearest vertices blend.
+        found_on_rays: what `candidates` found.
+        index: which of these to map.
+        begin: first place in `index`.
+        end: place behind the last.
+
+    Returns:
+        number of the candidate, k nearest vertices and their weights, canonical point, inverse transform [S 12], and
+        distance to the nearest vertex of each sample; then number of each candidate too far from the body, and how many
+        metres too far.
+    """
+    nearest, vertices = shell[3], shell[4]
+    other_low, other_voxel, other_row, other_nearest, other_vertices = canonical
+    ray_at, depth_at, row_at = found_on_rays
+    room = end - begin
+    number_of, far_of = np.empty(room, np.int64), np.empty(room, np.int64)
+    away_of, excess_of = np.empty(room, np.float32), np.empty(room, np.float32)
+    vertex_of, weight_of = np.empty((room, k), np.int64), np.empty((room, k), np.float32)
+    point_of, inverse_of = np.empty((room, 3), np.float32), np.empty((room, 12), np.float32)
+    found, squares, weights = np.zeros(LANES, np.int64), np.full(LANES, _FAR, np.float32), np.empty(k, np.float32)
+    around, buffer = np.full((3, LANES), _FAR, np.float32), np.empty((3, LANES), np.float32)
+    origins, directions = rays[0], rays[1]
+    count = far = 0
+    # Hardly any branch depends on the data, so the processor fetches the next samples' lists beforehand.
+    for place in range(begin, end):
+        i = index[place]
+        r, depth, at = ray_at[i], depth_at[i], row_at[i]
+        x, y, z = _on_ray(origins[r], directions[r], depth)
+        for j in range(nearest.shape[1]):
+            v = nearest[at, j]
+            around[0, j], around[1, j], around[2, j] = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+        _nearest(x, y, z, around, nearest, at, buffer, found, squares)
+        _weigh(squares, smooth, scale, weights)
+        _map(x, y, z, found, weights, forward, buffer, inverse_of, point_of, count)
+        number_of[count] = i
+        for j in range(k):
+            vertex_of[count, j], weight_of[count, j] = found[j], weights[j]
+        away_of[count] = np.sqrt(squares[0])
+        kept = squares[0] < limit * limit
+        if not kept:
+            far_of[far], excess_of[far] = i, away_of[count] - limit
+            far += 1
+        away = away_of[count] - slack
+        if kept and slack > 0 and away > 0:
+            kept = not _is_closer(
+                point_of[count, 0], point_of[count, 1], point_of[count, 2], away * away,
+                other_low, other_voxel, other_row, other_nearest, other_vertices,
+            )  # fmt: skip
+        count += int(kept)
+    return (
+        number_of[:count], vertex_of[:count], weight_of[:count], point_of[:count], inverse_of[:count],
+        away_of[:count], far_of[:far], excess_of[:far],
+    )  # fmt: skip
+
+
+@compiled_part
+def _on_ray(origin, direction, depth):  # noqa: ANN001, ANN202
+    """The point of a ray at a depth."""
+    return origin[0] + depth * direction[0], origin[1] + depth * direction[1], origin[2] + depth * direction[2]
+
+
+@compiled_part
+def _row_at(x, y, z, low, inverse, row):  # noqa: ANN001, ANN202
+    """What `row` says of a point's voxel; outside of the grid -1."""
+    a = int(np.floor((x - low[0]) * inverse))
+    b = int(np.floor((y - low[1]) * inverse))
+    c = int(np.floor((z - low[2]) * inverse))
+    if a < 0 or b < 0 or c < 0 or a >= row.shape[0] or b >= row.shape[1] or c >= row.shape[2]:
+        return np.int32(-1)
+    return row[a, b, c]
 
 
 @compiled_part
@@ -183,13 +242,9 @@ def _map(x, y, z, found, weights, forward, buffer, inverse, point, s):  # noqa: 
 @compiled_part
 def _is_closer(x, y, z, square, low, voxel, row, nearest, vertices):  # noqa: ANN001, ANN202
     """Whether a listed vertex of a shell is closer to a point than the root of `square`."""
-    inverse = np.float32(1 / voxel)
-    a = int(np.floor((x - low[0]) * inverse))
-    b = int(np.floor((y - low[1]) * inverse))
-    c = int(np.floor((z - low[2]) * inverse))
-    if a < 0 or b < 0 or c < 0 or a >= row.shape[0] or b >= row.shape[1] or c >= row.shape[2] or row[a, b, c] < 0:
+    at = _row_at(x, y, z, low, np.float32(1 / voxel), row)
+    if at < 0:
         return False
-    at = row[a, b, c]
     for j in range(nearest.shape[1]):
         v = nearest[at, j]
         dx, dy, dz = x - vertices[v, 0], y - vertices[v, 1], z - vertices[v, 2]
