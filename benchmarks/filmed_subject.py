@@ -78,7 +78,7 @@ def staged(person: Performer, act: Act, yaw: float) -> Performer:
         joints = positions(person.shaped, torch.from_numpy(poses).float(), still)
         feet = joints[:, [7, 8, 10, 11]].mean(1)
         away = (center_of_mass(joints) - feet).double().numpy()
-        heading = Rotation.from_euler("y", Rotation.from_rotvec(poses[:, 0]).as_euler("yxz")[:, 0])
+        heading = Rotation.from_euler("y", Rotation.from_rotvec(poses[:, 0]).as_euler("yxz")[:, :1])
         angle = np.arctan2(heading.inv().apply(away)[:, 2], away[:, 1])
         tilt = heading * Rotation.from_rotvec(-angle[:, None] * [1.0, 0, 0]) * heading.inv()
         poses[:, 0] = (tilt * Rotation.from_rotvec(poses[:, 0])).as_rotvec()

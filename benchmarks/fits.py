@@ -113,16 +113,15 @@ def watched(clip: Clip, cache: Path) -> Watched:
     folder = cache / clip.name
     if not (folder / "track.npz").exists():
         found = watch_clip(clip.frames, clip.info.frames, mediapipe_estimator(), folder)
-        times = {"seconds": np.array(found.seconds), "steps": np.array(found.steps)}
+        times = {name: np.array(getattr(found, name)) for name in ("seconds", "steps", "sources")}
         np.savez(folder / "track.npz", **vars(found.track), **times)
     data = np.load(folder / "track.npz")
     count = len(data["pixels"])
     images, masks = ([folder / f"{k:06d}.{kind}" for k in range(count)] for kind in ("jpg", "png"))
     track = Track(data["pixels"], data["visibility"], data["world"])
-    times = data["seconds"].tolist(), data["steps"].tolist()
+    sources, seconds, steps = (tuple(data[name].tolist()) for name in ("sources", "seconds", "steps"))
     return Watched(
-        tuple(images), tuple(masks), track, tuple(range(count)), tuple(times[0]), tuple(times[1]), None, (),
-        offsets=blazepose_offsets(),
+        tuple(images), tuple(masks), track, sources, seconds, steps, None, (), offsets=blazepose_offsets()
     )  # fmt: skip
 
 
@@ -166,8 +165,11 @@ def filmed(options: argparse.Namespace) -> dict[str, dict[str, float | str]]:
         folder = options.cache / f"filmed-{name.replace(' ', '-')}"
         camera, joints = film(name, 20 + seed, folder)
         clip = open_clips([folder], PrepareConfig(fps=FPS))[0]
-        evidence = alone(replace(clip, name=f"{folder.name}-found"), watched(clip, options.cache / "found"))
-        rows[name] = measured(body, evidence, FPS, joints, camera.world_to_camera[:3, 1])
+        seen = watched(clip, options.cache / "found")
+        # Images that equal the one before them are left out.
+        truth = joints[list(seen.sources)]
+        evidence = alone(replace(clip, name=f"{folder.name}-found"), seen)
+        rows[name] = measured(body, evidence, FPS, truth, camera.world_to_camera[:3, 1])
         rows[name]["true_focal_pixels"] = round(float(camera.intrinsics[0, 0]), 1)
         print(name, rows[name], flush=True)
     return rows

@@ -1,6 +1,7 @@
 """A range cut into parts: nothing twice, nothing left out, in order."""
 
 import threading
+import weakref
 from functools import wraps
 from itertools import chain
 
@@ -10,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twofold.kernels.parallel import compiled, in_parts
+from twofold.kernels.parallel import ahead, compiled, in_parts, one_thread_each
 
 
 @pytest.fixture(params=[1, 3])
@@ -89,3 +90,91 @@ def test_a_damaged_cache_is_compiled_past_and_a_sound_one_is_used(monkeypatch, t
     for file in tmp_path.rglob("*.nb*"):
         file.write_bytes(b"junk")
     assert compiled(triple)(2.0) == 6.0
+
+
+def test_a_part_that_cuts_its_own_range_does_that_alone(threads):
+    """Else all threads would wait for parts that no thread is left for."""
+
+    def work(begin, end):
+        return in_parts(50, lambda first, last: (first, last), least=1)
+
+    for parts in in_parts(threads, work, least=1):
+        assert list(chain.from_iterable(range(*part) for part in parts)) == list(range(50))
+        assert threads == 1 or parts == [(0, 50)]
+
+
+def test_operations_take_one_thread_and_ranges_are_still_cut():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with one_thread_each():
+            assert torch.get_num_threads() == 1
+            assert len(in_parts(30, lambda begin, end: None, least=1)) == 3
+        assert torch.get_num_threads() == 3
+        with pytest.raises(ValueError, match="inside"), one_thread_each():
+            raise ValueError("inside")
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_the_next_item_is_made_while_one_is_used():
+    asked = threading.Semaphore(0)
+
+    def items():
+        for number in range(3):
+            asked.release()
+            yield number
+
+    taken = ahead(items())
+    assert next(taken) == 0
+    assert asked.acquire(timeout=20)  # Item 0
+    assert asked.acquire(timeout=20)  # Item 1, which nobody has asked for yet
+    assert not asked.acquire(timeout=0.05)
+    assert list(taken) == [1, 2]
+
+
+def test_an_error_comes_when_its_item_is_due():
+    def items():
+        yield 0
+        raise ValueError("the second item")
+
+    taken = ahead(items())
+    assert next(taken) == 0
+    with pytest.raises(ValueError, match="the second item"):
+        next(taken)
+
+
+def test_items_are_gone_when_their_user_is_done_with_them():
+    class Item:
+        pass
+
+    made = []
+
+    def items():
+        for _ in range(20):
+            item = Item()
+            made.append(weakref.ref(item))
+            yield item
+            del item
+
+    for item in ahead(items()):
+        del item
+        assert sum(one() is not None for one in made) <= 1
+
+
+def test_a_user_who_stops_ends_the_thread():
+    before, closed = threading.active_count(), []
+
+    def items():
+        try:
+            yield from range(100)
+        finally:
+            closed.append(True)
+
+    taken = ahead(items())
+    assert next(taken) == 0
+    taken.close()
+    del taken
+    assert closed == [True]
+    assert threading.active_count() == before

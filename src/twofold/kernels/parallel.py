@@ -2,8 +2,10 @@
 
 import contextlib
 import inspect
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
 from functools import lru_cache
 from typing import Any, TypeVar, final
 
@@ -12,6 +14,11 @@ import torch
 from numba.core.caching import FunctionCache
 
 Result = TypeVar("Result")
+Item = TypeVar("Item")
+_PARTS: ContextVar[int | None] = ContextVar("_PARTS", default=None)
+"""How many parts ranges are cut into, where it is not PyTorch's number of threads."""
+_INSIDE = threading.local()
+"""Tells whether this thread already handles a part: it does not share that out again."""
 _OPTIONS: dict[str, Any] = {"nogil": True, "no_cfunc_wrapper": True}
 """Without the interpreter's lock; nothing calls a loop from C."""
 _PART_OPTIONS: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True}
@@ -59,9 +66,34 @@ class _Cache(FunctionCache):
             self.disable()
 
 
+@contextlib.contextmanager
+def one_thread_each() -> Generator[None]:
+    """While the block lasts, each PyTorch operation takes one thread, and `in_parts` still cuts ranges as before.
+
+    For thousands of small operations: sharing each of them out costs more than it saves.
+    """
+    threads = torch.get_num_threads()
+    token = _PARTS.set(_parts())
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        _PARTS.reset(token)
+
+
+def _parts() -> int:
+    if getattr(_INSIDE, "part", False):
+        return 1
+    return _PARTS.get() or torch.get_num_threads()
+
+
 @lru_cache(maxsize=4)
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="twofold")
+    def begin() -> None:
+        _INSIDE.part = True
+
+    return ThreadPoolExecutor(threads, thread_name_prefix="twofold", initializer=begin)
 
 
 def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) -> list[Result]:
@@ -75,8 +107,31 @@ def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) 
     Returns:
         what `work` gave for each part, in order.
     """
-    threads = max(1, min(torch.get_num_threads(), count // max(least, 1)))
+    threads = max(1, min(_parts(), count // max(least, 1)))
     if threads == 1:
         return [work(0, count)]
     bounds = [count * part // threads for part in range(threads + 1)]
     return list(_pool(threads).map(work, bounds[:-1], bounds[1:]))
+
+
+def ahead(items: Iterable[Item]) -> Generator[Item]:
+    """The items in order; while one is used, the next is made in another thread.
+
+    Only that one is kept beside the one in use. What making an item raises is raised here, when it is its turn.
+
+    >>> list(ahead(n * n for n in range(3)))
+    [0, 1, 4]
+    """
+    source, end = iter(items), object()
+
+    def following() -> Item | object:
+        return next(source, end)
+
+    with ThreadPoolExecutor(1, thread_name_prefix="ahead") as thread:
+        coming = thread.submit(following)
+        while (item := coming.result()) is not end:
+            coming = thread.submit(following)
+            # Passed on without a name of its own here, so that it is gone when its user is done with it.
+            held = [item]
+            del item
+            yield held.pop()  # pyright: ignore[reportReturnType]

@@ -6,10 +6,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.geometry.cameras import Camera
+from twofold.geometry.face_kernels import nearest_faces
 from twofold.geometry.raster import supersampled
 from twofold.kernels.parallel import in_parts
 from twofold.outputs.export.character import Character, normals_of
-from twofold.outputs.raster_kernels import nearest_faces, project, shade
+from twofold.outputs.raster_kernels import project, shade
 
 
 def render_mesh(

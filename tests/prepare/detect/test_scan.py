@@ -1,5 +1,6 @@
 """A clip gone through once: one clean person a mask, everything put aside as files, nothing kept in memory."""
 
+import threading
 import weakref
 
 import numpy as np
@@ -11,7 +12,8 @@ from PIL import Image
 from scipy import ndimage
 
 from twofold.errors import TwofoldError
-from twofold.prepare.detect.scan import clean_mask, spread_out, watch_clip
+from twofold.prepare.detect import scan
+from twofold.prepare.detect.scan import clean_mask, save_picture, spread_out, watch_clip
 from twofold.prepare.detections import Observation, nobody
 from twofold.prepare.video.frames import VideoFrame
 
@@ -150,6 +152,61 @@ def test_images_masks_and_landmarks_are_put_aside(tmp_path):
     assert sorted(path.name for path in (tmp_path / "a" / "b").iterdir()) == sorted(
         f"{k:06d}.{ending}" for k in range(6) for ending in ("jpg", "png")
     )
+
+
+def test_the_estimator_sees_the_images_in_order_while_others_are_written_and_decoded(tmp_path, monkeypatch):
+    """Three threads at a time, each at an image of its own."""
+    at_work, names = threading.Barrier(3, timeout=20), set()
+
+    def together(number):
+        names.add(threading.get_ident())
+        if number == 3:
+            at_work.wait()
+
+    class Slow(Finder):
+        def __call__(self, image, seconds):
+            found = super().__call__(image, seconds)
+            together(len(self.shown) - 2)  # looks at image 4
+            return found
+
+    def decoded():
+        for frame in clip_frames(8):
+            together(frame.index - 2)  # decodes image 5
+            yield frame
+
+    finder, done = Slow(), []
+
+    def save(path, pixels, **options):
+        if path.suffix == ".jpg":
+            done.append(path)
+            together(len(done) - 1)  # writes image 3
+        save_picture(path, pixels, **options)
+
+    monkeypatch.setattr(scan, "save_picture", save)
+    seen = watch_clip(decoded(), 8, finder, tmp_path)
+    assert len(names) == 3
+    assert [second for *_, second in finder.shown] == pytest.approx([k / 10 for k in range(8)])
+    assert np.array_equal(seen.track.pixels[:, 0, 0], [1, 2, np.nan, 4, 5, 6, 7, 8], equal_nan=True)
+
+
+@pytest.mark.parametrize("where", ["decoding", "estimating"])
+def test_an_error_in_a_thread_is_the_users_sentence(tmp_path, where):
+    class Fails(Finder):
+        def __call__(self, image, seconds):
+            if where == "estimating" and len(self.shown) == 2:
+                raise TwofoldError("The third image is bad.")
+            return super().__call__(image, seconds)
+
+    def decoded():
+        yield from clip_frames(2)
+        if where == "decoding":
+            raise TwofoldError("The third image is bad.")
+        yield from clip_frames(4)
+
+    before = threading.active_count()
+    with pytest.raises(TwofoldError, match=r"^The third image is bad\.$"):
+        watch_clip(decoded(), 6, Fails(), tmp_path)
+    assert threading.active_count() == before
 
 
 def test_images_are_undistorted_before_anybody_looks(tmp_path):

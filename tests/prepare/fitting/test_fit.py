@@ -1,5 +1,7 @@
 """A body that acts is found again: in its shape, its motion and its outline, by one camera and by several."""
 
+import threading
+import time
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -214,9 +216,56 @@ def test_the_same_evidence_gives_the_same_motion():
         assert torch.equal(value, getattr(second, name)), name
 
 
+def test_windows_fitted_side_by_side_give_the_same_motion_as_one_after_the_other(monkeypatch):
+    monkeypatch.setattr(fit_module, "WINDOW", 8)
+    monkeypatch.setattr(fit_module, "OVERLAP", 3)
+    body, (view,) = the_body(), cameras(0.4)
+    evidence = evidence_of(body, acted(body, 26), view, noise=NOISE)
+    found = []
+    for threads in (1, 3):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        told = []
+        found.append(fit(body, [evidence], FPS, config=FitConfig(steps=(12, 4)), progress=told.append))
+        assert told == pytest.approx([1 / 3, 2 / 3, 1])
+    for name, value in vars(found[0]).items():
+        assert torch.equal(value, getattr(found[1], name)), name
+
+
+def test_other_windows_end_soon_after_one_has_failed(monkeypatch):
+    """Else a user who stops would wait for threads that go on."""
+    monkeypatch.setattr(fit_module, "WINDOW", 8)
+    monkeypatch.setattr(fit_module, "OVERLAP", 3)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    body, (view,) = the_body(), cameras(0.4)
+    evidence = evidence_of(body, acted(body, 26), view, noise=NOISE)
+    both, ended = threading.Barrier(2, timeout=20), threading.Event()
+    real, calls = fit_module._fit_window, []
+
+    def window(*given):
+        calls.append(given)
+        if len(calls) == 1:
+            return real(*given)
+        first = given[1][0].track.pixels[0, 0, 0] == evidence.track.pixels[8, 0, 0]
+        both.wait()
+        if first:
+            raise KeyboardInterrupt
+        try:
+            while True:
+                given[-1](0.5)
+                time.sleep(0.01)
+        finally:
+            ended.set()
+
+    monkeypatch.setattr(fit_module, "_fit_window", window)
+    with pytest.raises(KeyboardInterrupt):
+        fit(body, [evidence], FPS, config=FitConfig(steps=(12, 4)))
+    assert ended.wait(timeout=20)
+
+
 @pytest.fixture
 def short_windows(monkeypatch):
-    """Windows of eight frames that share three, and a note of how much each traced and of what."""
+    """Windows of eight frames that share three, one after the other, and a note of how much each traced and of what."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     monkeypatch.setattr(fit_module, "WINDOW", 8)
     monkeypatch.setattr(fit_module, "OVERLAP", 3)
     traced = []

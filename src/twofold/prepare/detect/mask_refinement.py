@@ -60,16 +60,21 @@ def background_plate(
     images: Sequence[UInt8[np.ndarray, "h w 3"]], masks: Sequence[UInt8[np.ndarray, "h w"]]
 ) -> BackgroundPlate:
     """The background of a still camera from images and the person's masks in them (0..255)."""
-    hidden = np.stack([_near(mask) for mask in masks])
+    near = in_parts(len(masks), lambda begin, end: [_near(mask) for mask in masks[begin:end]], 4)
+    hidden = np.stack([one for part in near for one in part])
     known = (~hidden).sum(0) >= MIN_SEEN
     color = np.zeros((*known.shape, 3), np.float32)
     deviation = np.zeros(known.shape, np.float32)
-    for top in range(0, len(known), _STRIP):
-        rows = slice(top, top + _STRIP)
-        seen = np.stack([image[rows] for image in images]).astype(np.float32)
-        seen[hidden[:, rows]] = np.nan
-        middle = _median(seen)
-        color[rows], deviation[rows] = middle, 1.48 * _median(np.abs(seen - middle)).mean(-1)
+
+    def strips(begin: int, end: int) -> None:
+        for top in range(begin * _STRIP, end * _STRIP, _STRIP):
+            rows = slice(top, top + _STRIP)
+            seen = np.stack([image[rows] for image in images]).astype(np.float32)
+            seen[hidden[:, rows]] = np.nan
+            middle = _median(seen)
+            color[rows], deviation[rows] = middle, 1.48 * _median(np.abs(seen - middle)).mean(-1)
+
+    in_parts(-(-len(known) // _STRIP), strips, 1)
     return BackgroundPlate(color, deviation, known)
 
 

@@ -4,7 +4,8 @@ Memory does not grow with the clip's length but for the landmarks, a few hundred
 """
 
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from scipy import ndimage
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors
 from twofold.geometry.silhouettes import overlap
+from twofold.kernels.parallel import ahead
 from twofold.prepare.detect.background import Surroundings, background_motion, surroundings_of
 from twofold.prepare.detect.person import Region, around_mask, only
 from twofold.prepare.detections import Estimator, Observation, Track, track_of
@@ -84,6 +86,9 @@ def watch_clip(
 ) -> Watched:
     """Looks at every image of a clip. One that equals the one before it, as stretched videos have them, is left out.
 
+    While one image is put aside, the estimator looks at the next, and the one after that is decoded, each in a thread
+    of its own. The estimator sees all images one after the other, as it follows the person from one to the next.
+
     Args:
         frames: in order.
         expected: about how many there are.
@@ -106,51 +111,86 @@ def watch_clip(
     sample: list[np.ndarray] = []
     views: list[Surroundings] = []
     overlaps: list[tuple[float, ...]] = []
-    before: np.ndarray | None = None
-    around: Region | None = None
-    repeated = 0
+    repeated = [0]
     with plain_errors(scratch):
         scratch.mkdir(parents=True, exist_ok=True)
+    decoded = ahead(_distinct(frames, repeated, undistort))
+    looked = ahead(_looked_at(decoded, estimator, undistort, given, region))
+    with closing(decoded), closing(looked):
+        for look in looked:
+            mask = clean_mask(look.found.mask)
+            drawn = [own for own in look.own if own is not None]
+            if len(given) > 1:
+                overlaps.append(tuple(np.nan if m is None else overlap(m > 127, mask > 127) for m in look.own))
+            elif drawn:
+                mask = drawn[0]
+            number = len(images)
+            images.append(scratch / f"{number:06d}.jpg")
+            masks.append(scratch / f"{number:06d}.png")
+            with plain_errors(scratch):
+                save_picture(images[-1], look.image, quality=_QUALITY, subsampling=0)
+                save_picture(masks[-1], mask, compress_level=1)
+            # The mask is a file now; keeping it would fill the memory.
+            found = look.found
+            seen.append(Observation(found.pixels, found.visibility, found.world, np.zeros((1, 1), np.uint8)))
+            sources.append((look.frame.source, look.frame.seconds, look.frame.step))
+            if number % max(1, expected // _SAMPLES) == 0:
+                sample.append(look.image)
+            if number % max(1, expected // _VIEWS) == 0:
+                views.append(surroundings_of(look.image, mask))
+            share = min(1.0, (look.frame.index + 1) / max(expected, 1))
+            del look, found, mask, drawn
+            if progress is not None:
+                progress(share)
+    if not images:
+        raise TwofoldError("A clip without any image cannot be prepared; choose another.")
+    places, seconds, steps = zip(*sources, strict=True)
+    return Watched(
+        tuple(images), tuple(masks), track_of(seen), places, seconds, steps, background_motion(views).moved,
+        tuple(sample), repeated[0], tuple(zip(*overlaps, strict=True)), offsets=estimator.offsets,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Look:
+    """One image with what was found in it and the user's own masks of it."""
+
+    frame: VideoFrame
+    image: UInt8[np.ndarray, "h w 3"]
+    found: Observation
+    own: list[UInt8[np.ndarray, "h w"] | None]
+
+
+def _distinct(
+    frames: Iterable[VideoFrame], repeated: list[int], undistort: Undistort | None
+) -> Generator[tuple[VideoFrame, UInt8[np.ndarray, "h w 3"]]]:
+    """Each image that differs from the one before it, with its undistorted form; the others are counted."""
+    before: np.ndarray | None = None
     for frame in frames:
         if before is not None and np.array_equal(before, frame.image):
-            repeated += 1
+            repeated[0] += 1
             continue
         before = frame.image
-        image = frame.image if undistort is None else undistort(frame.image)
+        yield frame, frame.image if undistort is None else undistort(frame.image)
+
+
+def _looked_at(
+    decoded: Iterable[tuple[VideoFrame, UInt8[np.ndarray, "h w 3"]]],
+    estimator: Estimator,
+    undistort: Undistort | None,
+    given: Sequence[Own],
+    region: Callable[[UInt8[np.ndarray, "h w 3"], int], Region | None] | None,
+) -> Generator[_Look]:
+    """What the estimator finds in each image; see `watch_clip`."""
+    around: Region | None = None
+    for frame, image in decoded:
         own = [_straight(reading(frame.source), undistort) for reading in given]
         drawn = [mask for mask in own if mask is not None]
         if region is not None:
             around = region(image, frame.source)
         elif drawn:
             around = around_mask(np.max(drawn, axis=0))
-        found = estimator(only(image, around), frame.seconds)
-        mask = clean_mask(found.mask)
-        if len(given) > 1:
-            overlaps.append(tuple(np.nan if m is None else overlap(m > 127, mask > 127) for m in own))
-        elif drawn:
-            mask = drawn[0]
-        number = len(images)
-        images.append(scratch / f"{number:06d}.jpg")
-        masks.append(scratch / f"{number:06d}.png")
-        with plain_errors(scratch):
-            save_picture(images[-1], image, quality=_QUALITY, subsampling=0)
-            save_picture(masks[-1], mask, compress_level=1)
-        # The mask is a file now; keeping it would fill the memory.
-        seen.append(Observation(found.pixels, found.visibility, found.world, np.zeros((1, 1), np.uint8)))
-        sources.append((frame.source, frame.seconds, frame.step))
-        if number % max(1, expected // _SAMPLES) == 0:
-            sample.append(image)
-        if number % max(1, expected // _VIEWS) == 0:
-            views.append(surroundings_of(image, mask))
-        if progress is not None:
-            progress(min(1.0, (frame.index + 1) / max(expected, 1)))
-    if not images:
-        raise TwofoldError("A clip without any image cannot be prepared; choose another.")
-    places, seconds, steps = zip(*sources, strict=True)
-    return Watched(
-        tuple(images), tuple(masks), track_of(seen), places, seconds, steps, background_motion(views).moved,
-        tuple(sample), repeated, tuple(zip(*overlaps, strict=True)), offsets=estimator.offsets,
-    )  # fmt: skip
+        yield _Look(frame, image, estimator(only(image, around), frame.seconds), own)
 
 
 def with_masks(watched: Watched, given: Own, undistort: Undistort | None = None) -> Watched:

@@ -10,6 +10,7 @@ from twofold.body.skeleton import JOINT_NAMES, Body
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.geometry.surfaces import vertex_normals
 from twofold.kernels.kdtree import search_tree
+from twofold.kernels.parallel import in_parts
 from twofold.prepare.fitting.body_landmarks import BodyPoints
 from twofold.prepare.fitting.observations import Seen
 from twofold.prepare.fitting.outlines import Outlines
@@ -189,15 +190,19 @@ def match_rims(
         scale = 0.1 * float(seen.size[k])
         found = torch.zeros(outlines.points.shape[:2], dtype=torch.int64)
         weight = torch.zeros(outlines.points.shape[:2])
-        for t in torch.nonzero(outlines.known)[:, 0].tolist():
-            rim = torch.nonzero(across[t].abs() < 0.35)[:, 0]
-            if len(rim) == 0:
-                continue
-            flat = torch.nn.functional.normalize(normals[t, rim, :2], dim=-1)
-            tree = search_tree(torch.cat([shown[t, rim], flat * scale], -1).numpy(), quick=True)
-            away, index = tree.query(torch.cat([outlines.points[t], outlines.normals[t] * scale], -1).numpy())
-            found[t] = rim[torch.from_numpy(index)]
-            weight[t] = torch.from_numpy(away < 1.5 * scale).float()
+
+        def match(begin: int, end: int) -> None:
+            for t in range(begin, end):
+                rim = torch.nonzero(across[t].abs() < 0.35)[:, 0]
+                if len(rim) == 0 or not outlines.known[t]:
+                    continue
+                flat = torch.nn.functional.normalize(normals[t, rim, :2], dim=-1)
+                tree = search_tree(torch.cat([shown[t, rim], flat * scale], -1).numpy(), quick=True)
+                away, index = tree.query(torch.cat([outlines.points[t], outlines.normals[t] * scale], -1).numpy())
+                found[t] = rim[torch.from_numpy(index)]
+                weight[t] = torch.from_numpy(away < 1.5 * scale).float()
+
+        in_parts(len(found), match, 8)
         weight = weight * (outlines.normals.norm(dim=-1) > 0.5)
     return choose(body, searched.index[found]), weight
 

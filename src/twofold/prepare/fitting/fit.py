@@ -6,6 +6,7 @@ smoothly, bend their joints one way only, and have one shape. Where feet of one 
 they stand on one level, and the body keeps its balance (see `footing`, `physics`).
 """
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -17,6 +18,7 @@ from torch import Tensor
 from twofold.body.skeleton import Body
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from twofold.kernels.parallel import in_parts, one_thread_each
 from twofold.prepare.fitting.body_landmarks import BodyPoints, body_points
 from twofold.prepare.fitting.energy import PriorWeights, direction_term, landmark_term, match_rims, outline_term, prior
 from twofold.prepare.fitting.footing import MAX_WORSE, carrying, standing, tells_the_vertical
@@ -98,7 +100,7 @@ def fit(
     """The body's shape and motion through a clip.
 
     A long clip is fitted window by window, after shape and focal length were found on a part of it, so that memory
-    does not grow with its length.
+    does not grow with its length. The other windows are fitted side by side, as many as there are threads.
 
     Args:
         body: of any kind; the shape coefficients that it has are fitted.
@@ -112,14 +114,9 @@ def fit(
     Raises:
         TwofoldError: nobody was found in any frame.
     """
-    threads = torch.get_num_threads()
-    # Thousands of small operations: sharing them out costs more than it saves.
-    torch.set_num_threads(1)
-    try:
-        config = config or (FitConfig() if len(evidence) == 1 else several_cameras())
+    config = config or (FitConfig() if len(evidence) == 1 else several_cameras())
+    with one_thread_each():
         return _fit(body, evidence, fps, free_focal, config, points_in_space, progress or (lambda done: None))
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _fit(
@@ -140,16 +137,31 @@ def _fit(
     # The window in which most is seen tells shape and focal length best.
     seen = [sum(float(e[slice(s, s + WINDOW)].track.visibility.sum()) for e in evidence) for s in starts]
     best = starts[int(np.argmax(seen))]
-    parts: list[FittedMotion] = []
     first = _window(evidence, points_in_space, slice(best, best + WINDOW + OVERLAP))
     # Distances told apart from translations would be those of one window only.
     known = _fit_window(body, first[0], fps, free_focal, config, first[1], None, lambda done: None).settled(body)
-    for number, start in enumerate(starts):
-        some, space = _window(evidence, points_in_space, slice(start, start + WINDOW + OVERLAP))
-        parts.append(
-            known if start == best else _fit_window(body, some, fps, False, config, space, known, lambda done: None)
-        )
-        progress((number + 1) / len(starts))
+    progress(1 / len(starts))
+    parts = [known] * len(starts)
+    rest = [number for number, start in enumerate(starts) if start != best]
+    stopped, counting, fitted = threading.Event(), threading.Lock(), [1]
+
+    def going_on(done: float) -> None:
+        if stopped.is_set():
+            raise InterruptedError("another window failed or the user stopped")
+
+    def windows(begin: int, end: int) -> None:
+        for number in rest[begin:end]:
+            some, space = _window(evidence, points_in_space, slice(starts[number], starts[number] + WINDOW + OVERLAP))
+            parts[number] = _fit_window(body, some, fps, False, config, space, known, going_on)
+            with counting:
+                fitted[0] += 1
+                progress(fitted[0] / len(starts))
+
+    try:
+        in_parts(len(rest), windows, 1)
+    except BaseException:
+        stopped.set()  # Threads would go on to the end of their windows.
+        raise
     return _joined(parts)
 
 

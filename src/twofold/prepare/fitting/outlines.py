@@ -12,6 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from twofold.images import read_grey
+from twofold.kernels.parallel import in_parts
 
 GRID = 128
 """Cells along the longer side of a mask's surroundings; a cell is about one percent of a person's height."""
@@ -77,7 +78,8 @@ def open_mask(mask: Mask) -> UInt8[np.ndarray, "h w"]:
 
 def trace_outlines(masks: Sequence[Mask]) -> Outlines:
     """Outlines of the masks of a clip."""
-    traced = [_trace(open_mask(mask)) for mask in masks]
+    parts = in_parts(len(masks), lambda begin, end: [_trace(open_mask(mask)) for mask in masks[begin:end]], 8)
+    traced = [one for part in parts for one in part]
     outside, corner, cell, points, normals, longer = (
         torch.from_numpy(np.stack(part)).float() for part in zip(*traced, strict=True)
     )

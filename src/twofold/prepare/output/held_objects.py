@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from PIL import Image, ImageDraw
 from scipy import ndimage
+
+from twofold.geometry.face_kernels import nearest_faces
 
 MIN_SIGHTINGS = 5
 """A vertex seen in fewer frames has no usual colour."""
@@ -50,22 +51,25 @@ def body_silhouette(
     pixels: Float[np.ndarray, "V 2"], faces: Int[np.ndarray, "F 3"], height: int, width: int
 ) -> Bool[np.ndarray, "h w"]:
     """Which pixels a body covers whose vertices, all in front of the camera, project to `pixels` (column, row)."""
-    return _paint(pixels, faces, np.ones(len(faces), dtype=int), height, width) > 0
+    first, second, third = (pixels[faces[:, corner]] for corner in range(3))
+    one, other = second - first, third - first
+    away = one[:, 0] * other[:, 1] > one[:, 1] * other[:, 0]
+    facing = np.where(away[:, None], faces[:, ::-1], faces)
+    return _nearest(pixels, np.ones(len(pixels)), facing, height, width) >= 0
 
 
-def _paint(
+def _nearest(
     pixels: Float[np.ndarray, "V 2"],
+    depth: Float[np.ndarray, "V"],
     faces: Int[np.ndarray, "F 3"],
-    numbers: Int[np.ndarray, "F"],
     height: int,
     width: int,
 ) -> Int[np.ndarray, "h w"]:
-    """Triangles painted one over the other, each in its number; 0 where there is none."""
-    canvas = Image.new("I", (width, height))
-    pen = ImageDraw.Draw(canvas)
-    for triangle, number in zip(pixels[faces].reshape(-1, 6).tolist(), numbers.tolist(), strict=True):
-        pen.polygon(triangle, fill=number)
-    return np.asarray(canvas)
+    """The nearest of the triangles that face the camera behind each pixel's centre, -1 where there is none."""
+    points = np.concatenate([pixels, depth[:, None]], 1).astype(np.float32)
+    face = np.full((height, width), -1, np.int32)
+    nearest_faces(points, faces.astype(np.int32), np.zeros((height, width), np.float32), face, 0, height)
+    return face
 
 
 def see_body(
@@ -77,7 +81,7 @@ def see_body(
     width: int,
     tolerance: float = 0.02,
 ) -> SeenBody:
-    """Paints a body's triangles from far to near.
+    """Which part of a body is seen in each pixel.
 
     Args:
         pixels: where its vertices project to (column, row).
@@ -86,19 +90,14 @@ def see_body(
         focal: of the camera, pixels.
         height: of the image.
         width: of the image.
-        tolerance: a vertex so far behind the painted surface still counts as seen, metres.
+        tolerance: a vertex so far behind the surface still counts as seen, metres.
     """
     pixels_per_metre = focal / float(np.median(depth))
     margin = np.ceil(0.3 * pixels_per_metre)
     low = np.clip(np.floor(pixels.min(0)) - margin, 0, (width - 1, height - 1)).astype(int)
     high = np.clip(np.ceil(pixels.max(0)) + margin + 1, low + 1, (width, height)).astype(int)
-    first, second, third = (pixels[faces[:, corner]] for corner in range(3))
-    # Half of the triangles face away, and a closed surface hides them.
-    one, other = second - first, third - first
-    facing = one[:, 0] * other[:, 1] < one[:, 1] * other[:, 0]
-    faces = faces[facing][np.argsort(-depth[faces[facing]].mean(1))]
     columns, rows = (high - low).tolist()
-    face = _paint(pixels - low, faces, 1 + np.arange(len(faces)), rows, columns) - 1
+    face = _nearest(pixels - low, depth, faces, rows, columns)
     rows, columns = np.nonzero(face >= 0)
     corners = faces[face[rows, columns]]
     away = np.square(pixels[corners] - low - np.stack([columns, rows], -1)[:, None]).sum(-1)

@@ -1,8 +1,8 @@
 """The fitted body held against every image: objects taken out of the masks, and a record of each image."""
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -82,7 +82,7 @@ def compare_with_pictures(
             return None
         return see_body(pixels.numpy(), depth.numpy(), faces, focal, camera.height, camera.width)
 
-    usual = _usual(watched, see) if held_objects == "remove" else None
+    usual: tuple[Float[np.ndarray, "V 3"], Bool[np.ndarray, "V"]] | None = None
     objects: list[tuple[Patch, ...]] = [()] * len(motion)
     ignored: dict[int, Path] = {}
     removed: dict[int, float] = {}
@@ -113,6 +113,8 @@ def compare_with_pictures(
     qualities: list[ImageQuality] = []
     # Painting, comparing and writing images leave the interpreter free most of the time.
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        if held_objects == "remove":
+            usual = _usual(watched, see, pool)
         if usual is not None:
             sightings: list[Sighting | None] = []
             for sighting in pool.map(look, range(len(motion))):
@@ -127,18 +129,20 @@ def compare_with_pictures(
 
 
 def _usual(
-    watched: Watched, see: Callable[[int], SeenBody | None]
+    watched: Watched, see: Callable[[int], SeenBody | None], pool: Executor
 ) -> tuple[Float[np.ndarray, "V 3"], Bool[np.ndarray, "V"]] | None:
     """The usual colours of the body's vertices."""
-    colors: list[UInt8[np.ndarray, "V 3"]] = []
-    visible: list[Bool[np.ndarray, "V"]] = []
-    times: Sequence[int] = spread_out(len(watched.images), _COLOR_SAMPLE)
-    for time in times:
+
+    def look(time: int) -> tuple[UInt8[np.ndarray, "V 3"], Bool[np.ndarray, "V"]] | None:
         seen = see(time)
         if seen is None:
-            continue
+            return None
         image, mask = read_rgb(watched.images[time]), open_mask(watched.masks[time])
         column, row = np.where(seen.visible[:, None], seen.pixels, 0).T
-        colors.append(image[row, column])
-        visible.append(seen.visible & (mask[row, column] > 127))
-    return usual_colors(np.stack(colors), np.stack(visible)) if colors else None
+        return image[row, column], seen.visible & (mask[row, column] > 127)
+
+    looks = [look for look in pool.map(look, spread_out(len(watched.images), _COLOR_SAMPLE)) if look is not None]
+    if not looks:
+        return None
+    colors, visible = (np.stack(part) for part in zip(*looks, strict=True))
+    return usual_colors(colors, visible)
