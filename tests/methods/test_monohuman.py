@@ -19,6 +19,7 @@ from twofold.methods.monohuman import MonoHumanConfig, monohuman
 from twofold.methods.subject import Subject
 from twofold.methods.table import recipe_from_dict, recipe_to_dict
 from twofold.training.loop import train
+from twofold.training.pixels import PixelSource
 from twofold.training.run import load, read_checkpoint
 
 RECIPE = CASES["monohuman"]
@@ -185,6 +186,30 @@ def test_interrupted_training_resumes_to_the_same_numbers_with_its_key_frames(pe
     assert whole["avatar.key_images"].any()
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
     assert torch.equal(load(tmp_path / "whole")[0].key_images, whole["avatar.key_images"])
+
+
+def test_images_have_a_say_in_the_weight_volume_of_the_fast_recipe(person):
+    recipe, cpu = CASES["monohuman_fast"], torch.device("cpu")
+    avatar = recipe.method.build(Subject.of(person), 0).train()
+    avatar.prepare_training(person, 0, torch.Generator())
+    mode = Mode(step=0)
+    avatar.before_step(mode)
+    config = replace(recipe.training.pixels, rays=600)
+    source = PixelSource(person.train, avatar.subject.body, avatar.subject.betas, config, avatar.ray_margin)
+    squared = dict.fromkeys(("reconstruction", "consistency"), 0.0)
+    for row, frame in enumerate(person.train):
+        generator = torch.Generator().manual_seed(row)
+        batch = source.draw(row, generator, cpu)
+        batch = batch.against(avatar.background(torch.zeros(3), len(batch.rays), generator))
+        posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
+        rendering = avatar.render(batch.rays, posed, batch.background, mode, generator)
+        terms = avatar.losses(rendering, batch, posed, mode, generator)
+        last = avatar.volume.upsampling[-1].taps
+        for name in squared:
+            (gradient,) = torch.autograd.grad(terms[name], last, retain_graph=True)
+            squared[name] += float(gradient.square().sum())
+    # Norms of one size: Adam follows whichever is the larger.
+    assert 0 < squared["consistency"] < 10**2 * squared["reconstruction"]
 
 
 def test_training_names_key_frames_that_do_not_exist(person, tmp_path):
