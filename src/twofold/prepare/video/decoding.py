@@ -18,6 +18,7 @@ from jaxtyping import Shaped, UInt8
 from twofold.errors import TwofoldError
 from twofold.inputs import is_there, require_file, shown_path
 from twofold.prepare.video.focal import focal_of_video
+from twofold.prepare.video.hdr import ColorSpace, to_srgb
 
 _LONGEST_GAP = 5.0  # Seconds; what is longer is a fault of the file's clock, not a pause.
 _USUAL_RATE = Fraction(25)
@@ -76,6 +77,7 @@ class VideoInfo:
         says_duration: the file itself says how long it is.
         remarks: sentences for the user.
         focal: focal length over the longer side, as the file states it; None where it does not.
+        color: how colours are coded.
     """
 
     width: int
@@ -87,6 +89,7 @@ class VideoInfo:
     says_duration: bool
     remarks: tuple[str, ...]
     focal: float | None = None
+    color: ColorSpace = ColorSpace(1, 1)
 
 
 def describe_video(path: Path) -> VideoInfo:
@@ -107,8 +110,9 @@ def describe_video(path: Path) -> VideoInfo:
             remarks.append(f"{path.name} asks to be turned by {turn.off:.0f} degrees more than it is; it is left so.")
         if first.interlaced_frame:
             remarks.append(f"{path.name} is interlaced, so moving edges are combed; deinterlace it for better results.")
-        if first.color_trc in (16, 18):
-            remarks.append(f"{path.name} is HDR video, whose colours come out flat; export it as SDR for true ones.")
+        color = ColorSpace(int(first.color_trc), int(first.color_primaries))
+        if not color.is_srgb:
+            remarks.append(color.remark(path.name))
         aspect = stream.sample_aspect_ratio or Fraction(1)
         if not Fraction(1, 5) <= aspect <= 5:
             aspect = Fraction(1)
@@ -119,7 +123,7 @@ def describe_video(path: Path) -> VideoInfo:
     rate = _rate(stated, measured, path, remarks)
     width, height = sides[::-1] if turn.transpose else sides
     duration = seconds or frames / rate
-    return VideoInfo(width, height, turn, rate, frames, duration, seconds is not None, tuple(remarks), focal)
+    return VideoInfo(width, height, turn, rate, frames, duration, seconds is not None, tuple(remarks), focal, color)
 
 
 def _rate(stated: Fraction | None, measured: float | None, path: Path, remarks: list[str]) -> float:
@@ -185,7 +189,7 @@ class Converter:
 
     def __init__(self, info: VideoInfo, width: int, height: int) -> None:
         """Images come out with `width` columns and `height` rows, averaged over areas."""
-        self._turn = info.orientation
+        self._turn, self._color = info.orientation, info.color
         self._stored = (height, width) if info.orientation.transpose else (width, height)
         self._reformatter = VideoReformatter()
 
@@ -195,10 +199,10 @@ class Converter:
         # Players take the newer matrix for large images that name none.
         unnamed = int(frame.colorspace) == 2 and frame.height >= 720
         rgb = self._reformatter.reformat(
-            frame, width, height, "rgb24", interpolation=Interpolation.AREA,
+            frame, width, height, "rgb24" if self._color.is_srgb else "rgb48le", interpolation=Interpolation.AREA,
             src_colorspace=Colorspace.ITU709 if unnamed else None,
-        )  # fmt: skip
-        return np.ascontiguousarray(self._turn.upright(rgb.to_ndarray()))
+        ).to_ndarray()  # fmt: skip
+        return np.ascontiguousarray(self._turn.upright(rgb if self._color.is_srgb else to_srgb(rgb, self._color)))
 
 
 @contextlib.contextmanager
