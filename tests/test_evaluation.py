@@ -73,7 +73,7 @@ def test_one_rendering_at_a_time_is_in_memory(capture, monkeypatch):
 
 
 def refined_avatar(parts):
-    avatar = Mock(spec=Avatar)
+    avatar = Mock(spec=Avatar, camera_response=None)
     avatar.parameters.return_value = []
     avatar.pose_corrections.return_value = PoseRefinement(torch.tensor([0]), 2, parts).change() if parts else {}
     return avatar

@@ -1,6 +1,7 @@
 """Evaluation: which frames are measured, how, and the file that says so."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,15 @@ MAX_IMAGES = 30
 def render_frame(avatar: Avatar, capture: Capture, frame: Frame, refined: bool) -> RenderedImage:
     """The avatar in a frame's pose from its camera; `refined` applies what was learned about poses at that time."""
     posed = pose_at(avatar, capture, frame) if refined else avatar.pose(frame.pose, frame.translation, None)
-    return render_image(avatar, posed, frame.camera, torch.tensor(capture.background))
+    background = torch.tensor(capture.background)
+    image = render_image(avatar, posed, frame.camera, background)
+    if avatar.camera_response is None:
+        return image
+    color = avatar.camera_response.image(image.color, image.opacity, background, frame.camera_name)
+    opacity = image.opacity if image.base_opacity is None else image.base_opacity
+    return replace(
+        image, color=color, base=avatar.camera_response.image(image.base, opacity, background, frame.camera_name)
+    )
 
 
 _REFINED = (
@@ -119,6 +128,8 @@ def measure_split(
     }
     if "base_silhouette_iou" in means:
         protocol["base_silhouette_iou"] = "silhouette_iou of the pose-independent branch rendered alone"
+    if avatar.camera_response is not None:
+        protocol["colours"] = avatar.camera_response.protocol()
     if any(shares):
         protocol["ignored"] = image_metrics.IGNORED_PROTOCOL.format(share=100 * float(np.mean(shares)))
     return means | {"protocol": protocol}
@@ -351,6 +362,9 @@ def measure(
     consistency = measure_consistency(avatar, capture, progress=lambda: count("consistency")) if networks else {}
     if consistency:
         metrics["consistency"] = consistency
+    if avatar.camera_response is not None:
+        told = "what each training camera multiplies colours with and adds to them, learned (training.camera_colors)"
+        metrics["camera_colors"] = {**avatar.camera_response.numbers(), "protocol": told}
     if _refines(avatar):
         metrics["pose_refinement"] = measure_refinement(
             avatar, capture, few, trained, lambda f, p: count("pose refinement")

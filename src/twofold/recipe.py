@@ -81,6 +81,9 @@ class TrainingConfig:
     checkpoint_every: int = 500
     preview_every: int = 1000
     """Steps between two preview images; 0 for none."""
+    camera_colors: Literal["off", "first", "mean"] = "off"
+    """Whether each of several training cameras has a learned gain and offset of its colours, and whose colours the
+    avatar then has: those of the first training camera or the mean of all. One camera needs none."""
     compile: Literal["never", "auto", "always"] = "never"
     """Whether dense networks run compiled (torch.compile): "auto" on a GPU only. The first step then takes minutes."""
 

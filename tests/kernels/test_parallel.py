@@ -1,5 +1,8 @@
 """A range cut into parts: nothing twice, nothing left out, in order."""
 
+import os
+import subprocess
+import sys
 import threading
 import weakref
 from functools import wraps
@@ -11,6 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from twofold.kernels import parallel
 from twofold.kernels.parallel import ahead, compiled, in_parts, one_thread_each
 
 
@@ -178,3 +182,28 @@ def test_a_user_who_stops_ends_the_thread():
     del taken
     assert closed == [True]
     assert threading.active_count() == before
+
+
+COLD = """
+import sys
+import numpy as np
+from twofold.geometry.face_kernels import nearest_faces
+if sys.argv[1:] == ["use"]:
+    points, faces = np.zeros((3, 3), np.float32), np.zeros((1, 3), np.int32)
+    nearest_faces(points, faces, np.zeros((2, 2), np.float32), np.zeros((2, 2), np.int32), 0, 2)
+    from twofold.kernels.parallel import compiled
+    nearest_faces(points.astype(float), faces, np.zeros((2, 2), np.float32), np.zeros((2, 2), np.int32), 0, 2)
+"""
+
+
+def test_the_first_compiling_is_announced_and_no_other(tmp_path):
+    """Neither an import nor a loop of another signature says anything, nor does a later process."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept"), "OMP_NUM_THREADS": "1"}
+
+    def said(*words):
+        command = [sys.executable, "-c", COLD, *words]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr
+
+    assert said() == ""
+    assert said("use") == f"{parallel.COMPILING}\n"
+    assert said("use") == ""

@@ -2,17 +2,20 @@
 
 import contextlib
 import inspect
+import sys
 import threading
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, TypeVar, final
 
 import numba
 import torch
 from numba.core.caching import FunctionCache
 
+_PACKAGE = Path(__file__).parents[1]
 Result = TypeVar("Result")
 Item = TypeVar("Item")
 _PARTS: ContextVar[int | None] = ContextVar("_PARTS", default=None)
@@ -52,11 +55,13 @@ class _Cache(FunctionCache):
     """Results kept on disk as far as that is possible; a cache that cannot be read or written is none."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled function, or None where it has to be compiled."""
-        try:
-            return super().load_overload(sig, target_context)
-        except Exception:  # A damaged cache fails in any way.
-            return None
+        """The compiled function, or None where it has to be compiled; said once where none is kept yet."""
+        found = None
+        with contextlib.suppress(Exception):  # A damaged cache fails in any way.
+            found = super().load_overload(sig, target_context)
+        if found is None:
+            _announce(Path(self.cache_path))
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keeps it, unless the disk refuses."""
@@ -64,6 +69,24 @@ class _Cache(FunctionCache):
             super().save_overload(sig, data)
         except Exception:  # What cannot be kept, or read to add to it, is compiled again next time.
             self.disable()
+
+
+COMPILING = "Compiling loops for this processor, once: about a minute."
+_announced = threading.Event()
+
+
+def _announce(folder: Path) -> None:
+    """Says on stderr that loops are compiled, once a process and only where no loop is kept on disk at all.
+
+    Args:
+        folder: where one loop would be kept: beside its source, or a folder of its package among those of others.
+    """
+    if _announced.is_set():
+        return
+    _announced.set()
+    place = _PACKAGE if folder.is_relative_to(_PACKAGE) else folder.parent
+    if next(place.rglob("*.nbi"), None) is None:
+        print(COMPILING, file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

@@ -17,6 +17,7 @@ from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
+from twofold.methods.camera_response import CameraResponse
 from twofold.methods.subject import Subject
 from twofold.metrics.perceptual import LPIPS
 from twofold.recipe import TrainingConfig
@@ -199,6 +200,8 @@ class Avatar(nn.Module, ABC, Generic[Own]):
     """A person that can be posed and rendered. Everything above methods uses only what stands here."""
 
     subject: Subject
+    camera_response: CameraResponse | None = None
+    """How known cameras show its colours, where a training has learned that; it is no part of the avatar itself."""
 
     @property
     def device(self) -> torch.device:

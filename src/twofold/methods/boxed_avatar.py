@@ -214,7 +214,12 @@ class BoxedAvatar(Avatar[BoxedPose[Shared]]):
             opacity=opacity,
             depth=second[:, 4] / opacity.detach().clamp_min(1e-6),
             normal=torch.zeros_like(behind),
-            extras={"coarse": first[:, :3] + (1 - first[:, 3:]) * behind, "weights": weights, "extra": extra},
+            extras={
+                "coarse": first[:, :3] + (1 - first[:, 3:]) * behind,
+                "coarse_opacity": first[:, 3],
+                "weights": weights,
+                "extra": extra,
+            },
         )
 
     def bounded(self, rays: Rays, own: BoxedPose[Shared]) -> tuple[Rays, Bool[Tensor, "R"]]:

@@ -20,7 +20,7 @@ ABSENT: dict[str, dict[str, object]] = {
     "method.completion": {
         "color": 0.0, "shape": 0.0, "light": 0.0, "points": 512, "samples": 40_000, "start": 200, "every": 200,
     },
-    "training": {"epochs": "images"},
+    "training": {"epochs": "images", "camera_colors": "off"},
     "training.pixels": {
         "reachable": "body", "subject": "half", "between": False, "replacement": True, "memory_gb": 1.0,
     },

@@ -22,6 +22,7 @@ from twofold.methods.base import Avatar, Mode, Stage
 from twofold.methods.subject import Subject
 from twofold.recipe import Recipe, TrainingConfig
 from twofold.sampling.joint_box import RELEASED_MARGIN, RELEASED_SLACK
+from twofold.training.camera_colors import RATE, CameraColors, LearnedResponse, load_camera_colors
 from twofold.training.clock import Clock
 from twofold.training.curves import Curves
 from twofold.training.lock import locked
@@ -65,10 +66,13 @@ class Step(nn.Module):
 
     color: Tensor
 
-    def __init__(self, avatar: Avatar, source: PixelSource, color: Float[Tensor, "3"], stage: Stage, seed: int) -> None:
+    def __init__(
+        self, avatar: Avatar, source: PixelSource, color: Float[Tensor, "3"], stage: Stage, seed: int,
+        colors: CameraColors | None = None,
+    ) -> None:  # fmt: skip
         """Everything a step needs beside its number; `color` is the capture's background."""
         super().__init__()
-        self.avatar, self.source, self.stage, self.seed = avatar, source, stage, seed
+        self.avatar, self.source, self.stage, self.seed, self.colors = avatar, source, stage, seed, colors
         self.register_buffer("color", color, persistent=False)
 
     def forward(self, step: int, mode: Mode, team: Team) -> tuple[dict[str, Tensor], Tensor]:
@@ -87,9 +91,13 @@ class Step(nn.Module):
             batch = batch.against(self.avatar.background(self.color, len(batch.rays), generator))
             posed = self.avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
             rendering = self.avatar.render(batch.rays, posed, batch.background, mode, generator)
+            if self.colors is not None:
+                rendering = self.colors.seen(rendering, batch, frame.camera_name)
             for name, term in self.avatar.losses(rendering, batch, posed, mode, generator).items():
                 terms[name] = terms.get(name, 0) + term / images
             error = error + (rendering.color.detach() - batch.color).square().mean() / images
+        if self.colors is not None:
+            terms["camera_colors"] = self.colors.penalty()
         return terms, error
 
 
@@ -143,9 +151,11 @@ def rate_factor(config: TrainingConfig, step: int, frames: int) -> float:
     return factor
 
 
-def make_optimizer(avatar: Avatar, config: TrainingConfig) -> torch.optim.Optimizer:
-    """Adam with one learning rate a parameter group."""
+def make_optimizer(avatar: Avatar, config: TrainingConfig, colors: CameraColors | None = None) -> torch.optim.Optimizer:
+    """Adam with one learning rate a parameter group, the training cameras' colours last."""
     groups = [{"params": g.parameters, "lr": g.rate, "name": g.name} for g in avatar.parameter_groups() if g.parameters]
+    if colors is not None:
+        groups.append({"params": list(colors.parameters()), "lr": RATE, "name": "camera colours"})
     return torch.optim.Adam(groups, betas=config.adam_betas, eps=config.adam_epsilon, fused=True)
 
 
@@ -233,7 +243,7 @@ def train(
                 if done % config.checkpoint_every == 0 or done in run.ends or stop:
                     # In this order: the curves are cut back to the checkpoint, not the other way round.
                     curves.save()
-                    write_checkpoint(folder, avatar, run.optimizer, done, run.restarts, clock.spent())
+                    write_checkpoint(folder, avatar, run.optimizer, done, run.restarts, clock.spent(), run.colors)
                 if preview and config.preview_every and done % config.preview_every == 0 and done < steps:
                     avatar.eval()
                     preview(avatar, done)
@@ -270,6 +280,9 @@ class _Run:
         self.ends = list(itertools.accumulate(stage.training.steps for stage in self.stages))
         self.steps = self.ends[-1]
         self.color = torch.tensor(capture.background, device=device)
+        cameras, wanted = dict.fromkeys(frame.camera_name for frame in capture.train), recipe.training.camera_colors
+        self.colors = CameraColors([*cameras], wanted).to(device) if wanted != "off" and len(cameras) > 1 else None
+        avatar.camera_response = None if self.colors is None else LearnedResponse(self.colors)
         self.current = -1
 
     @property
@@ -298,6 +311,8 @@ class _Run:
             return
         tensors, self.step, self.restarts = read_checkpoint(self.folder)
         load_state(self.avatar, {n[7:]: t for n, t in tensors.items() if n.startswith("avatar.")}, self.folder)
+        if self.colors is not None:
+            load_camera_colors(self.colors, tensors, self.folder)
         # A checkpoint at the very end of a stage still holds that stage's state.
         self._enter(next((i for i, end in enumerate(self.ends) if self.step <= end), len(self.ends) - 1), prepared=True)
         load_optimizer(self.optimizer, tensors)
@@ -307,12 +322,12 @@ class _Run:
         if not prepared:
             generator = torch.Generator().manual_seed(mixed(self.seed, 11, stage, self.restarts))
             self.avatar.prepare_training(self.capture, stage, generator)
-        self.optimizer = make_optimizer(self.avatar, chosen.training)
+        self.optimizer = make_optimizer(self.avatar, chosen.training, self.colors)
         self.rates = [group["lr"] for group in self.optimizer.param_groups]
         subject = self.avatar.subject
         margins = self.avatar.ray_margin, RELEASED_MARGIN + RELEASED_SLACK / subject.scene_scale
         source = PixelSource(frames, subject.body, subject.betas, chosen.training.pixels, *margins)
-        module = Step(self.avatar, source, self.color, chosen, self.seed)
+        module = Step(self.avatar, source, self.color, chosen, self.seed, self.colors)
         self.module = self.team.shared(module) if self.team.size > 1 else module
 
     def advance(self) -> tuple[dict[str, Tensor], Tensor]:
@@ -352,6 +367,9 @@ class _Run:
         state = self.recipe.method.build(self.avatar.subject, self.seed).state_dict()
         self.avatar.load_stored(state)
         self.avatar.load_state_dict(state)
+        if self.colors is not None:
+            for parameter in self.colors.parameters():
+                parameter.data.zero_()
         self._enter(0, prepared=False)
 
 

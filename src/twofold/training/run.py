@@ -1,5 +1,6 @@
 """A run: its recipe, its folder, its checkpoints. Everything later starts at `load`."""
 
+import json
 import os
 import platform
 import re
@@ -27,6 +28,7 @@ from twofold.methods.subject import Subject
 from twofold.methods.table import learning_rates, recipe_from_dict, recipe_to_dict
 from twofold.npz import read_npz
 from twofold.recipe import Recipe
+from twofold.training.camera_colors import CameraColors, LearnedResponse, load_camera_colors
 from twofold.training.clock import Spent
 
 RECIPE, ABOUT, SUBJECT, COVERAGE, CHECKPOINT, CURVES = (
@@ -242,7 +244,29 @@ def load(folder: Path, device: torch.device | str = "cpu") -> tuple[Avatar, int]
             f"{folder / CHECKPOINT} holds {broken} with numbers that are not finite, so its avatar cannot be used; "
             f"{lower_rates(recipe)}."
         )
+    colors = read_camera_colors(folder)
+    avatar.camera_response = None if colors is None else LearnedResponse(colors.to(device))
     return avatar.to(device).eval(), step
+
+
+def read_camera_colors(folder: Path) -> CameraColors | None:
+    """The learned colours of a run's training cameras, as its newest checkpoint has them; None where it has none.
+
+    Raises:
+        TwofoldError: there is no checkpoint, or it is damaged.
+    """
+    tensors, _, _ = read_checkpoint(folder)
+    if "camera_colors.offset" not in tensors:
+        return None
+    recipe, cameras = read_recipe(folder), json.loads(_metadata(folder / CHECKPOINT).get("cameras", "[]"))
+    colors = CameraColors(cameras, "first" if recipe.training.camera_colors == "first" else "mean")
+    load_camera_colors(colors, tensors, folder)
+    return colors
+
+
+def _metadata(file: Path) -> dict[str, str]:
+    with safe_open(file, framework="pt") as stored:
+        return stored.metadata() or {}
 
 
 def not_finite(tensors: Mapping[str, Tensor]) -> str:
@@ -268,7 +292,7 @@ def _kind(tensor: Tensor) -> tuple[torch.Size, bool]:
 
 def write_checkpoint(
     folder: Path, avatar: Avatar, optimizer: torch.optim.Optimizer, step: int, restarts: int = 0,
-    spent: Spent | None = None,
+    spent: Spent | None = None, colors: CameraColors | None = None,
 ) -> None:  # fmt: skip
     """Stores everything that continuing needs, beside the old checkpoint and then in its place.
 
@@ -279,17 +303,21 @@ def write_checkpoint(
         step: how many were made.
         restarts: how often the training has begun again.
         spent: the time that all of it took.
+        colors: of the training cameras, where they are learned.
 
     Raises:
         TwofoldError: a parameter is not finite, so the old checkpoint stays; or the disk refuses.
     """
     tensors = {f"avatar.{name}": t for name, t in avatar.state_dict().items()}
+    if colors is not None:
+        tensors |= {f"camera_colors.{name}": t for name, t in colors.state_dict().items()}
     for index, values in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{index}.{key}": torch.as_tensor(value) for key, value in values.items()}
     require_finite(tensors, folder, step)
     whole = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     with write_atomically(folder / CHECKPOINT) as beside:
         about = {"step": str(step), "restarts": str(restarts), "tensors": str(len(whole)), "twofold": __version__}
+        about |= {} if colors is None else {"cameras": json.dumps(colors.names)}
         beside.write_bytes(save(whole, metadata=about | (spent.as_text() if spent else {})))
 
 
