@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_person
 import torch
 from dense_start import dense
 from PIL import Image
 from small_recipes import CASES
 from test_processes import ended, together
-from tiny_person import ring_camera, tiny_recipe, write_person
+from tiny_person import tiny_recipe
 
 from twofold import evaluation
 from twofold.capture.folder import read_capture
@@ -124,31 +123,6 @@ def test_a_cameras_colours_are_learned_and_the_avatar_has_the_firsts(two_cameras
     metrics = evaluation.measure(avatar, two_cameras, 2, 0)
     assert "training.camera_colors" in metrics["train"]["protocol"]["colours"]  # type: ignore[index]
     assert metrics["camera_colors"]["side_gain_blue"] == pytest.approx(float(colors.gains().detach()[1, 2]))  # type: ignore[index]
-
-
-@pytest.mark.slow
-def test_a_darker_camera_costs_little_of_a_novel_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three cameras train, one of them 15 % darker and tinted; one between them measures."""
-    cameras = {"left": -0.5, "right": 0.5, "dark": 0.1, "between": 0.3}
-    monkeypatch.setattr(tiny_person, "person_cameras", lambda: {n: ring_camera(a) for n, a in cameras.items()})
-    splits = {"train": dict.fromkeys(("left", "right", "dark"), range(7)), "novel_view": {"between": range(7)}}
-    monkeypatch.setattr(tiny_person, "SPLITS", splits)
-    found = {}
-    for name in ("as it is", "darker"):
-        folder = write_person(tmp_path / name)
-        for file in (folder / "images" / "dark").iterdir() if name == "darker" else ():
-            image = np.asarray(Image.open(file).convert("RGB"))
-            tinted = image * [0.85 * 1.05, 0.85, 0.85 * 0.95]
-            Image.fromarray(tinted.round().clip(0, 255).astype(np.uint8)).save(file)
-        capture = read_capture(folder)
-        for colors in ("off", "first"):
-            run = tmp_path / f"{name} {colors}"
-            avatar = train(capture, recipe_of(400, colors, checkpoint_every=1000), run, CPU)
-            found[name, colors] = float(evaluation.measure_split(avatar, capture, "novel_view")["psnr_box"])  # type: ignore[arg-type]
-    lost = {colors: found["as it is", "off"] - found["darker", colors] for colors in ("off", "first")}
-    assert lost["off"] > 0.5, found
-    assert lost["first"] < 0.4 * lost["off"], found
-    assert found["as it is", "first"] > found["as it is", "off"] - 0.3, found
 
 
 def test_an_interrupted_run_continues_to_the_same_bits(two_cameras: Capture, tmp_path: Path) -> None:
