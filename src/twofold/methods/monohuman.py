@@ -242,8 +242,9 @@ def monohuman_fast() -> Recipe:
         reachable="body", subject="half",
     )  # fmt: skip
     training = replace(
-        start.training, steps=1500, pixels=pixels, decay=0.03, decay_from=0.1, checkpoint_every=250, preview_every=500
-    )
+        start.training, steps=1500, pixels=pixels, warmup=50, decay=0.03, decay_from=0.1, checkpoint_every=250,
+        preview_every=500,
+    )  # fmt: skip
     return replace(start, name="monohuman_fast", method=method, training=training)
 
 

@@ -8,7 +8,7 @@ from twofold.field.inverted_sphere import InvertedSphereFieldConfig
 from twofold.field.prefit import PrefitConfig
 from twofold.losses import LossConfig
 from twofold.methods.pose_schedule import PoseConfig
-from twofold.methods.vid2avatar import NO_SEPARATION, SeparationConfig, Vid2AvatarConfig
+from twofold.methods.vid2avatar import NO_SEPARATION, SeparationConfig, Vid2AvatarConfig, Vid2AvatarRates
 from twofold.recipe import PixelConfig, Recipe, TrainingConfig
 from twofold.sampling.error_bounded import ErrorBoundedSampler
 from twofold.sampling.shell_sampler import ShellSampler
@@ -66,10 +66,13 @@ def vid2avatar_mask() -> Recipe:
 def vid2avatar_fast() -> Recipe:
     """`vid2avatar` with what makes it affordable and changes no equation, and shorter schedules: hours on a laptop."""
     recipe = _faster(vid2avatar())
-    # The weights of separation move on four epochs in one, so that they end where the long training does.
-    separation = SeparationConfig(pace=4.0, surface_every=5)
+    # The weights of separation move on four epochs in one, so that they end where the long training does. A few epochs
+    # of few images leave a surface that is still too wide; to take it for the canonical one would keep it so.
+    separation = SeparationConfig(pace=4.0, in_shape=10.0)
     scene = InvertedSphereFieldConfig(hidden_dtype="auto")
-    method = replace(recipe.method, center="world", scene=scene, separation=separation)
+    method = replace(
+        recipe.method, center="world", scene=scene, separation=separation, beta=0.01, rates=Vid2AvatarRates(scene=1e-3)
+    )
     return replace(recipe, name="vid2avatar_fast", method=method, training=replace(recipe.training, steps=1500))
 
 
