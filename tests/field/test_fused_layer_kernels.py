@@ -8,6 +8,7 @@ from twofold.field import fused_layer_kernels as layers
 from twofold.field import fused_lookup_kernels as lookups
 from twofold.field.grids import build_lattices, interpolate_in_torch, pullback_in_torch
 from twofold.kernels.parallel import compiled
+from twofold.kernels.row_gradient import NOW
 
 RNG = np.random.default_rng(1)
 
@@ -114,8 +115,13 @@ def test_scattered_cotangents_are_the_transposes(grid):
         pullback_in_torch(leaf, x.double(), torch.from_numpy(u).double(), lattices) * torch.from_numpy(direction)
     ).sum()
     for kernel, given, whole in ((lookups.scatter, (u,), value), (lookups.scatter_slopes, (u, direction), slope)):
-        found = np.zeros(table.shape, np.float32)
+        found, marks = np.zeros(table.shape, np.float32), np.zeros(len(table), np.uint8)
         for level in (0, 1):
-            kernel(x.numpy(), *given, arrays, found, level, level + 1)
+            kernel(x.numpy(), *given, arrays, found, marks, level, level + 1)
+        unmarked = np.zeros_like(found)
+        kernel(x.numpy(), *given, arrays, unmarked, marks[:0], 0, 2)
+        np.testing.assert_array_equal(unmarked, found)
+        assert set(marks) == {0, NOW}
+        assert not found[marks == 0].any()
         expected = torch.autograd.grad(whole, leaf, retain_graph=True)[0].numpy()
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=2e-3)

@@ -27,6 +27,8 @@ from twofold.field.grids import (
 )
 from twofold.field.output import FieldOutput
 from twofold.field.small_net import SmallNet
+from twofold.kernels.lanes import QUAD
+from twofold.kernels.row_gradient import RowGradient
 
 DETAILED = ("head", "left_wrist", "right_wrist", "left_hand", "right_hand", "left_foot", "right_foot")
 """Faces, hands and shoes: what neither bends much nor is covered by cloth that folds."""
@@ -172,6 +174,14 @@ class GridField(nn.Module):
             groups[kind].append(parameter)
         return groups
 
+    def row_gradients(self, collect: bool) -> dict[nn.Parameter, RowGradient]:
+        """The gradients of the tables, added up in rows from now on, or no more: where both branches are compiled."""
+        grids = [getattr(self, name) for name in ("low_grid", "high_grid") if hasattr(self, name)]
+        possible = collect and self.config.features % QUAD == 0 and not self.light.weight.is_cuda
+        for grid in grids:
+            grid.row_gradient = RowGradient.of(grid.table) if possible else None
+        return {grid.table: grid.row_gradient for grid in grids if grid.row_gradient is not None}
+
     def _geometry(self, x: Tensor, pose: Tensor, slopes: Literal["none", "constant", "trained"]) -> _Geometry:
         """Distances and features of both branches; `slopes` says whether their gradients by x are wanted too."""
         g = _Geometry(self.pose_code(pose) if hasattr(self, "pose_code") else None)
@@ -233,7 +243,8 @@ class GridField(nn.Module):
         width = float("inf") if config.gate_width is None else config.gate_width
         lattices = (prior, self.low_grid.lattices, self.high_grid.lattices)
         tables = (self.get_buffer("prior"), self.low_grid.table, self.high_grid.table)
-        return in_quads(FusedField(*tables, lattices, nets, width))  # type: ignore[arg-type]
+        rows = self.low_grid.row_gradient, self.high_grid.row_gradient
+        return in_quads(FusedField(*tables, lattices, nets, width, rows))  # type: ignore[arg-type]
 
     def _gate(self, s1: Tensor) -> Tensor:
         if self.config.gate_width is None:

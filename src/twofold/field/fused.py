@@ -17,12 +17,14 @@ from twofold.field import fused_lookup_kernels as lookups
 from twofold.field.grids import Lattices
 from twofold.kernels.lanes import QUAD
 from twofold.kernels.parallel import in_parts
+from twofold.kernels.row_gradient import RowGradient
 
 _LAYERS = 6
 """Weight and bias of a net's three layers."""
 Net = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 """Weight and bias of the first, second and last layer; the pose's part of the first bias included."""
 Cotangents = tuple[Tensor | None, ...]
+_NO_MARKS = np.zeros(0, np.uint8)
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class FusedField:
         lattices: of prior, low and high grid.
         nets: distance and colour network of the low branch, then of the high one.
         gate_width: metres; infinite for plain sums.
+        rows: where the gradients of the low and the high table are added up, in place of ordinary ones.
     """
 
     prior: Float[Tensor, "N P"]
@@ -45,6 +48,7 @@ class FusedField:
     lattices: tuple[Lattices, Lattices, Lattices]
     nets: tuple[Net, Net, Net, Net]
     gate_width: float
+    rows: tuple[RowGradient | None, RowGradient | None] = (None, None)
 
     @torch.no_grad()
     def sdf(self, x: Float[Tensor, "S 3"]) -> Float[Tensor, "S"]:
@@ -164,7 +168,7 @@ class _Gradient(torch.autograd.Function):
     def backward(ctx: Any, *by: Tensor | None) -> Cotangents:
         _ = ctx.saved_tensors
         field, given, (by_s, by_g) = ctx.field, ctx.given, by
-        by_x, found = None, list[Tensor]()
+        by_x, found = None, list[Tensor | None]()
         if by_g is not None:
             found.extend(_by_slopes(field, given, _array(by_g)))
         if by_s is not None:
@@ -172,7 +176,7 @@ class _Gradient(torch.autograd.Function):
             more = (*given, np.zeros((len(by_s), 3, 3), np.float32), np.zeros((3, 9), np.float32))
             cotangents = (_array(by_s), none[:, 0].copy(), none, none)
             by_x, _, *values = _by_values(field, more, (none, none), cotangents, ctx.needs_input_grad[1])
-            found = [a + b for a, b in zip(values, found, strict=True)] if found else values
+            found = [_both(a, b) for a, b in zip(values, found, strict=True)] if found else values
         return None, by_x, *(found or [None] * len(field.parameters()))
 
 
@@ -193,14 +197,14 @@ def _by_values(
 
     parts = in_parts(count, part)
     tables = [
-        _scattered(lookups.scatter, table, grid, given[0], u)
-        for table, grid, u in zip((field.low, field.high), grids, features, strict=True)
+        _scattered(lookups.scatter, table, rows, grid, given[0], u)
+        for table, rows, grid, u in zip((field.low, field.high), field.rows, grids, features, strict=True)
     ]
     by_law = _summed([law for _, law in parts])
     return [points if by_x else None, by_law, *tables, *_by_nets([nets for nets, _ in parts])]
 
 
-def _by_slopes(field: FusedField, given: Any, by_g: np.ndarray) -> list[Tensor]:
+def _by_slopes(field: FusedField, given: Any, by_g: np.ndarray) -> list[Tensor | None]:
     """Gradients by tables and nets from those by the distance's gradient."""
     count, (_, *grids) = len(by_g), given[1]
     features = [np.empty((count, table.shape[1] * len(place)), np.float32) for table, _, place, _ in grids]
@@ -213,10 +217,16 @@ def _by_slopes(field: FusedField, given: Any, by_g: np.ndarray) -> list[Tensor]:
 
     parts = in_parts(count, part)
     tables = [
-        _scattered(lookups.scatter_slopes, table, grid, given[0], u, slope)
-        for table, grid, u, slope in zip((field.low, field.high), grids, features, (by_g, pushed), strict=True)
+        _scattered(lookups.scatter_slopes, table, rows, grid, given[0], u, slope)
+        for table, rows, grid, u, slope in zip(
+            (field.low, field.high), field.rows, grids, features, (by_g, pushed), strict=True
+        )
     ]
     return [*tables, *_by_nets(parts)]
+
+
+def _both(one: Tensor | None, other: Tensor | None) -> Tensor | None:
+    return other if one is None else one if other is None else one + other
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -237,8 +247,11 @@ def _by_nets(parts: list[list[tuple[np.ndarray, ...]]]) -> list[Tensor]:
     return [_summed([part[net][k] for part in parts]) for net in range(4) for k in range(_LAYERS)]
 
 
-def _scattered(kernel: Callable[..., None], table: Tensor, grid: Any, *arrays: np.ndarray) -> Tensor:
-    """Gradient by a table; a level owns its rows, so levels run side by side."""
-    by_table = torch.zeros_like(table)
-    in_parts(len(grid[2]), lambda begin, end: kernel(*arrays, grid, by_table.numpy(), begin, end), least=1)
+def _scattered(
+    kernel: Callable[..., None], table: Tensor, rows: RowGradient | None, grid: Any, *arrays: np.ndarray
+) -> Tensor | None:
+    """Gradient by a table, or None where it is added to `rows`; a level owns its rows, so levels run side by side."""
+    by_table = torch.zeros_like(table) if rows is None else None
+    values, marks = (by_table.numpy(), _NO_MARKS) if rows is None else (rows.values, rows.marks)
+    in_parts(len(grid[2]), lambda begin, end: kernel(*arrays, grid, values, marks, begin, end), least=1)
     return by_table

@@ -119,10 +119,13 @@ def pulled(slopes, u, s, axis, columns):  # noqa: ANN001, ANN201
 
 
 @compiled
-def scatter(x, by_features, grid, by_table, first, end):  # noqa: ANN001, ANN201
-    """by_table[N C] += transpose of `lookup` for the levels first..end, which own their rows."""
+def scatter(x, by_features, grid, by_table, marks, first, end):  # noqa: ANN001, ANN201
+    """by_table[N C] += transpose of `lookup` for the levels first..end, which own their rows; marks[N] = 2 there.
+
+    `marks` may be empty.
+    """
     _, rows, place, shape = grid
-    one, width = np.float32(1), by_table.shape[1]
+    one, width, marking = np.float32(1), by_table.shape[1], marks.shape[0] > 0
     for level in range(first, end):
         far_i, far_j = shape[level, 1] * shape[level, 2], shape[level, 2]
         for s in range(x.shape[0]):
@@ -133,6 +136,8 @@ def scatter(x, by_features, grid, by_table, first, end):  # noqa: ANN001, ANN201
                     flat = wide * (v if b else one - v)
                     near = base + a * far_i + b * far_j
                     r0, r1 = rows[near], rows[near + 1]
+                    if marking:
+                        marks[r0] = marks[r1] = 2
                     for c in range(0, width, QUAD):
                         value = load4(by_features, s, level * width + c)
                         store4(by_table, r0, c, scaled_plus(flat * (one - w), value, load4(by_table, r0, c)))
@@ -140,10 +145,13 @@ def scatter(x, by_features, grid, by_table, first, end):  # noqa: ANN001, ANN201
 
 
 @compiled
-def scatter_slopes(x, by_slopes, direction, grid, by_table, first, end):  # noqa: ANN001, ANN201
-    """by_table[N C] += derivative of <direction, J^T by_slopes> by the table, J the derivative of `lookup` by x."""
+def scatter_slopes(x, by_slopes, direction, grid, by_table, marks, first, end):  # noqa: ANN001, ANN201
+    """by_table[N C] += derivative of <direction, J^T by_slopes> by the table, J the derivative of `lookup` by x.
+
+    marks[N] = 2 where something is added; `marks` may be empty.
+    """
     _, rows, place, shape = grid
-    one, width = np.float32(1), by_table.shape[1]
+    one, width, marking = np.float32(1), by_table.shape[1], marks.shape[0] > 0
     for level in range(first, end):
         far_i, far_j = shape[level, 1] * shape[level, 2], shape[level, 2]
         scale = place[level, 3]
@@ -158,6 +166,8 @@ def scatter_slopes(x, by_slopes, direction, grid, by_table, first, end):  # noqa
                         wd, dd = (w, dz) if d else (one - w, -dz)
                         slope = da * wb * wd + wa * db * wd + wa * wb * dd
                         row = rows[base + a * far_i + b * far_j + d]
+                        if marking:
+                            marks[row] = 2
                         for c in range(0, width, QUAD):
                             value = load4(by_slopes, s, level * width + c)
                             store4(by_table, row, c, scaled_plus(slope, value, load4(by_table, row, c)))

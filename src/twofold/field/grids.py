@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from twofold.field import grid_kernels as kernels
 from twofold.geometry.surfaces import nearest_vertices, vertex_normals
 from twofold.kernels.parallel import in_parts
+from twofold.kernels.row_gradient import RowGradient
 
 
 @dataclass(frozen=True)
@@ -276,6 +277,8 @@ class FeatureGrid(nn.Module):
         count = int(lattices.rows.max()) + 1
         self.table = nn.Parameter((torch.rand(count, features, generator=generator) - 0.5) * 2e-3)
         self.size = features * len(voxels)
+        self.row_gradient: RowGradient | None = None
+        """Where compiled loops add up the table's gradient while it is trained with `RowAdam`."""
 
     @property
     def lattices(self) -> Lattices:

@@ -17,6 +17,7 @@ from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
+from twofold.kernels.row_gradient import RowGradient
 from twofold.methods.camera_response import CameraResponse
 from twofold.methods.subject import Subject
 from twofold.metrics.perceptual import LPIPS
@@ -350,6 +351,10 @@ class Avatar(nn.Module, ABC, Generic[Own]):
     @abstractmethod
     def parameter_groups(self) -> list[ParameterGroup]:
         """Trainable parameters of the current stage with their learning rates."""
+
+    def row_gradients(self, collect: bool) -> dict[nn.Parameter, RowGradient]:
+        """Tables whose gradients compiled loops add up row by row from now on; none of them with `collect` off."""
+        return {}
 
     @property
     def ray_margin(self) -> float:

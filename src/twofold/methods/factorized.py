@@ -7,13 +7,14 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from twofold.config import require
 from twofold.field.factorized import FactorizedField, FactorizedFieldConfig
 from twofold.field.factorized_grid import GridField, GridFieldConfig
 from twofold.field.output import FieldOutput
 from twofold.geometry.surfaces import vertex_normals
+from twofold.kernels.row_gradient import RowGradient
 from twofold.kernels.runtime import compiled_methods
 from twofold.methods.base import Batch, Mode, ParameterGroup, Rendering
 from twofold.methods.factorized_config import RateConfig
@@ -96,6 +97,10 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
         pose = [p for p in self.refinement.parameters() if p.requires_grad]
         groups = {**self.field.parameter_groups(), "beta": [self.raw_beta], "pose": pose}
         return [ParameterGroup(name, getattr(self.config.rates, name), group) for name, group in groups.items()]
+
+    def row_gradients(self, collect: bool) -> dict[nn.Parameter, RowGradient]:
+        """See `Avatar.row_gradients`: the tables of feature grids."""
+        return self.field.row_gradients(collect) if isinstance(self.field, GridField) else {}
 
     def background(
         self, color: Float[Tensor, "3"], rays: int, generator: torch.Generator

@@ -28,6 +28,7 @@ from twofold.training.curves import Curves
 from twofold.training.lock import locked
 from twofold.training.pixels import PixelSource
 from twofold.training.processes import Team, joined
+from twofold.training.row_adam import RowAdam
 from twofold.training.run import (
     CHECKPOINT,
     load_optimizer,
@@ -151,12 +152,19 @@ def rate_factor(config: TrainingConfig, step: int, frames: int) -> float:
     return factor
 
 
-def make_optimizer(avatar: Avatar, config: TrainingConfig, colors: CameraColors | None = None) -> torch.optim.Optimizer:
-    """Adam with one learning rate a parameter group, the training cameras' colours last."""
+def make_optimizer(
+    avatar: Avatar, config: TrainingConfig, colors: CameraColors | None = None, alone: bool = True
+) -> torch.optim.Optimizer:
+    """Adam with one learning rate a parameter group, the training cameras' colours last.
+
+    Large tables are updated row by row where a process trains `alone`.
+    """
     groups = [{"params": g.parameters, "lr": g.rate, "name": g.name} for g in avatar.parameter_groups() if g.parameters]
     if colors is not None:
         groups.append({"params": list(colors.parameters()), "lr": RATE, "name": "camera colours"})
-    return torch.optim.Adam(groups, betas=config.adam_betas, eps=config.adam_epsilon, fused=True)
+    # Clipping, and the mean over processes, need ordinary gradients.
+    rows = avatar.row_gradients(collect=alone and config.clip == 0)
+    return RowAdam(groups, rows, config.adam_betas, config.adam_epsilon)
 
 
 def wants_compiling(config: TrainingConfig, device: torch.device) -> bool:
@@ -251,6 +259,7 @@ def train(
             if stop:
                 raise KeyboardInterrupt
         team.wait()
+    avatar.row_gradients(collect=False)
     return avatar.eval()
 
 
@@ -322,7 +331,7 @@ class _Run:
         if not prepared:
             generator = torch.Generator().manual_seed(mixed(self.seed, 11, stage, self.restarts))
             self.avatar.prepare_training(self.capture, stage, generator)
-        self.optimizer = make_optimizer(self.avatar, chosen.training, self.colors)
+        self.optimizer = make_optimizer(self.avatar, chosen.training, self.colors, self.team.size == 1)
         self.rates = [group["lr"] for group in self.optimizer.param_groups]
         subject = self.avatar.subject
         margins = self.avatar.ray_margin, RELEASED_MARGIN + RELEASED_SLACK / subject.scene_scale

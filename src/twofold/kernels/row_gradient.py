@@ -1,0 +1,103 @@
+"""Gradients of tables of which a training step looks at few rows: kept between steps, and only those rows are visited.
+
+A feature grid has millions of rows and a step touches some ten thousands. An ordinary gradient would be as large as the
+table, filled with zeros and added up anew at each step.
+"""
+
+# pyright: reportMissingParameterType=false
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from twofold.kernels.parallel import compiled, in_parts
+
+NEVER, BEFORE, NOW = 0, 1, 2
+"""A row that had no gradient yet; that had one in an earlier step; that has one in this step."""
+
+
+@dataclass(frozen=True)
+class RowGradient:
+    """The gradient of a table, added up by compiled loops.
+
+    Attributes:
+        values: the gradient; zero in rows that are not marked `NOW`.
+        marks: of each row `NEVER`, `BEFORE` or `NOW`.
+    """
+
+    values: Float[np.ndarray, "N C"]
+    marks: np.ndarray
+
+    @classmethod
+    def of(cls, table: Float[Tensor, "N C"]) -> "RowGradient":
+        """No gradient yet, for a table."""
+        return cls(np.zeros(tuple(table.shape), np.float32), np.zeros(len(table), np.uint8))
+
+    def add(self, gradient: Float[Tensor, "N C"]) -> None:
+        """Adds an ordinary gradient."""
+        values = gradient.detach().numpy()
+        self.values[:] += values
+        self.marks[values.any(1)] = NOW
+
+    def know(self, moments: Float[Tensor, "N C"]) -> None:
+        """Takes the rows that have had a gradient from an optimizer's second moments; none has one now."""
+        self.values[:] = 0
+        self.marks[:] = np.where(moments.detach().numpy().any(1), BEFORE, NEVER)
+
+
+@torch.no_grad()
+def adam_rows(
+    table: Float[Tensor, "N C"], first: Float[Tensor, "N C"], second: Float[Tensor, "N C"], gradient: RowGradient,
+    rate: float, step: int, betas: tuple[float, float], epsilon: float,
+) -> None:  # fmt: skip
+    r"""A step of Adam for the rows that have, or had, a gradient; the gradient is zero afterwards.
+
+    \[ m \leftarrow m + (1 - \beta_1)(g - m), \qquad v \leftarrow \beta_2 v + (1 - \beta_2) g^2, \qquad
+    p \leftarrow p - \frac{\eta}{1 - \beta_1^t} \, \frac{m}{\sqrt{v} / \sqrt{1 - \beta_2^t} + \epsilon} \]
+
+    (Kingma and Ba, 2015). For all other rows m and v are zero and nothing changes, so this is Adam, not an
+    approximation of it.
+
+    >>> table = torch.ones(2, 1)
+    >>> gradient = RowGradient.of(table)
+    >>> gradient.add(torch.tensor([[3.0], [0.0]]))
+    >>> adam_rows(table, torch.zeros(2, 1), torch.zeros(2, 1), gradient, 0.5, 1, (0.9, 0.99), 1e-15)
+    >>> table[:, 0], gradient.values[:, 0]
+    (tensor([0.5000, 1.0000]), array([0., 0.], dtype=float32))
+
+    Args:
+        table: parameters; changed.
+        first: mean of the gradients; changed.
+        second: mean of their squares; changed.
+        gradient: of this step.
+        rate: learning rate.
+        step: number of this step, from 1 on.
+        betas: how much of the means is kept.
+        epsilon: added to the root.
+    """
+    size, root = rate / (1 - betas[0] ** step), (1 - betas[1] ** step) ** 0.5
+    numbers = (np.float32(value) for value in (size, 1 - betas[0], betas[1], 1 - betas[1], root, epsilon))
+    arrays = (t.detach().numpy() for t in (table, first, second))
+    given = (*arrays, gradient.values, gradient.marks, *numbers)
+    in_parts(len(table), lambda begin, end: _adam_rows(*given, begin, end), least=65_536)
+
+
+@compiled
+def _adam_rows(table, first, second, gradient, marks, size, rest1, beta2, rest2, root, epsilon, begin, end):  # noqa: ANN001, ANN202
+    for row in range(begin, end):
+        mark = marks[row]
+        if mark == 0:
+            continue
+        for c in range(table.shape[1]):
+            g = gradient[row, c]
+            m = first[row, c] + rest1 * (g - first[row, c])
+            v = second[row, c] * beta2 + rest2 * g * g
+            first[row, c], second[row, c] = m, v
+            table[row, c] -= size * m / (np.sqrt(v) / root + epsilon)
+        if mark == 2:
+            for c in range(table.shape[1]):
+                gradient[row, c] = np.float32(0)
+            marks[row] = 1
