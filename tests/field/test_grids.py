@@ -187,6 +187,22 @@ def test_every_point_within_the_radius_has_eight_nodes_of_its_own(seed, radius):
     assert (interpolate(shared, x, lattices) == 0).all()
 
 
+def test_a_level_may_end_closer_to_the_body_than_others():
+    points = np.random.default_rng(3).normal(size=(40, 3)).astype(np.float32) * 0.1
+    lattices, nodes = build_lattices(points, (0.04, 0.02), [0.1, 0.03])
+    wide, _ = build_lattices(points, (0.04, 0.02), 0.1)
+    table = torch.ones(len(nodes), 1)
+    first = lattices.rows[lattices.shape[1, 3]]  # what stands for everywhere else on the second level
+    table[first] = 0
+    near = torch.from_numpy(points + np.float32(0.01))
+    far = torch.from_numpy(points.max(0, keepdims=True) + np.float32(0.075))
+    torch.testing.assert_close(interpolate_in_torch(table, near, lattices)[:, 1], torch.ones(40))
+    assert interpolate_in_torch(table, far, lattices)[:, 1].max() == 0
+    assert interpolate_in_torch(table, torch.full((1, 3), 9.0), lattices)[:, 1].max() == 0
+    assert interpolate_in_torch(table, far, lattices)[:, 0].min() > 0.999
+    assert lattices.rows.max() < wide.rows.max()
+
+
 def test_rows_number_the_nodes_near_the_body():
     assert int(LATTICES.rows.max()) + 1 == len(POSITIONS)
     for level, voxel in enumerate(VOXELS):

@@ -8,6 +8,7 @@ from small_recipes import CASES
 
 from twofold.methods.subject import Subject
 from twofold.training import loop
+from twofold.training.row_adam import RowAdam
 
 
 def trained(person, recipe, folder, steps, monkeypatch, rows=True, resume=False):
@@ -66,3 +67,61 @@ def test_gradients_are_ordinary_ones_with_clipping_and_after_training(person, re
     assert avatar.field.high_grid.row_gradient is not None
     avatar.row_gradients(collect=False)
     assert avatar.field.high_grid.row_gradient is None
+
+
+def visited(rates, gradients, start):
+    """Frames' corrections trained by visits, one frame a step."""
+    table = torch.nn.Parameter(start.clone())
+    groups = [{"params": [table], "lr": rates, "name": "pose", "by_visit": True}]
+    optimizer = RowAdam(groups, {}, (0.9, 0.99), 1e-15)
+    for frame, gradient in gradients:
+        table.grad = torch.zeros_like(table)
+        table.grad[frame] = gradient
+        optimizer.step()
+    return table.detach(), optimizer
+
+
+def test_a_frame_moves_only_in_steps_that_see_it():
+    generator = torch.Generator().manual_seed(0)
+    start = torch.zeros(4, 23, 3)
+    shown = [(step % 3, torch.randn(23, 3, generator=generator)) for step in range(9)]
+    table, optimizer = visited(0.01, shown, start)
+    assert not table[3].any()
+    before, _ = visited(0.01, shown[:-3], start)
+    last, _ = visited(0.01, shown[:-2], start)
+    assert torch.equal(before[1:], last[1:])
+    assert not torch.equal(before[0], last[0])
+    assert optimizer.state_dict()["state"][0]["visits"].tolist() == [3, 3, 3, 0]
+    # As if each frame had an optimizer of its own.
+    for frame in range(3):
+        own = torch.nn.Parameter(torch.zeros(23, 3))
+        apart = torch.optim.Adam([own], lr=0.01, betas=(0.9, 0.99), eps=1e-15)
+        for which, gradient in shown:
+            if which == frame:
+                own.grad = gradient
+                apart.step()
+        torch.testing.assert_close(table[frame], own.detach())
+
+
+def test_noise_moves_a_frame_less_by_visits_than_by_steps():
+    """A frame is seen in one of 64 steps; its gradients are noise around nothing."""
+    generator = torch.Generator().manual_seed(1)
+    shown = [(step % 64, torch.randn(8, generator=generator)) for step in range(64 * 30)]
+    start = torch.zeros(64, 8)
+    by_visits, _ = visited(0.001, shown, start)
+    table = torch.nn.Parameter(start.clone())
+    optimizer = RowAdam([{"params": [table], "lr": 0.001, "name": "pose"}], {}, (0.9, 0.99), 1e-15)
+    for frame, gradient in shown:
+        table.grad = torch.zeros_like(table)
+        table.grad[frame] = gradient
+        optimizer.step()
+    assert by_visits.std() < 0.2 * table.detach().std()
+
+
+def test_quick_and_vid2avatar_ask_for_visits_of_poses_where_the_recipe_does(person):
+    for name in ("quick", "vid2avatar"):
+        for moments in ("steps", "visits"):
+            method = CASES[name].method
+            avatar = replace(method, pose=replace(method.pose, moments=moments)).build(Subject.of(person), 0)
+            asked = {group.name for group in avatar.parameter_groups() if group.by_visit}
+            assert asked == ({"pose"} if moments == "visits" else set())

@@ -56,6 +56,8 @@ class GridFieldConfig:
     """The pose is squeezed to this many numbers before the pose-dependent branch sees it."""
     radius: float = 0.1
     """Features exist this far from the canonical body, metres; at least the shell's radius."""
+    finest_radius: float | None = None
+    """The same of the finest spacing of the pose-dependent branch alone, metres; none: like all others."""
     gate_width: float | None = 0.05
     """Distance from the low branch's surface at which the high branch has half its effect, metres; none: plain sums."""
     branches: Literal["both", "low", "high", "high_rendered"] = "both"
@@ -76,6 +78,7 @@ class GridFieldConfig:
         require_within(
             self, low_voxels=(0.003, 1), high_voxels=(0.003, 1), detail_voxels=(0.003, 1), features=(1, 64),
             width=(1, 1024), shared=(1, 256), pose_code=(1, 1024), radius=(0.005, 0.5), gate_width=(1e-4, 10),
+            finest_radius=(0.005, 0.5),
         )  # fmt: skip
 
     def build(self, body: PosedBody, pose_size: int = 69, generator: torch.Generator | None = None) -> "GridField":
@@ -158,7 +161,11 @@ class GridField(nn.Module):
             self.low_sdf = SmallNet(size, width, 1 + shared, low_code, generator)
             self.low_color = SmallNet(size + shared, width, 3 + shared, low_code, generator)
         if self.has_high:
-            self.high_grid = FeatureGrid(points, config.high_voxels, config.features, config.radius, generator)
+            radius: float | list[float] = config.radius
+            if config.finest_radius is not None:
+                finest = min(config.high_voxels)
+                radius = [config.finest_radius if v == finest else config.radius for v in config.high_voxels]
+            self.high_grid = FeatureGrid(points, config.high_voxels, config.features, radius, generator)
             size = self.high_grid.size
             self.high_sdf = SmallNet(size + handed, width, 1 + shared, high_code, generator)
             self.high_color = SmallNet(size + shared + handed, width, 3, high_code, generator)

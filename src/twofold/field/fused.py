@@ -251,7 +251,11 @@ def _scattered(
     kernel: Callable[..., None], table: Tensor, rows: RowGradient | None, grid: Any, *arrays: np.ndarray
 ) -> Tensor | None:
     """Gradient by a table, or None where it is added to `rows`; a level owns its rows, so levels run side by side."""
-    by_table = torch.zeros_like(table) if rows is None else None
-    values, marks = (by_table.numpy(), _NO_MARKS) if rows is None else (rows.values, rows.marks)
+    by_table = None
+    if rows is None:
+        by_table = torch.zeros_like(table)
+        values, marks = by_table.numpy(), _NO_MARKS
+    else:
+        values, marks = rows.values, rows.marks
     in_parts(len(grid[2]), lambda begin, end: kernel(*arrays, grid, values, marks, begin, end), least=1)
     return by_table

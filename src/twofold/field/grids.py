@@ -39,7 +39,7 @@ class Lattices:
 def build_lattices(
     points: Float[np.ndarray, "n 3"],
     voxels: tuple[float, ...],
-    radius: float,
+    radius: float | Sequence[float],
     by_level: Sequence[Float[np.ndarray, "_ 3"]] | None = None,
 ) -> tuple[Lattices, Float[np.ndarray, "N 3"]]:
     r"""The nodes within `radius` metres (plus a cell's diagonal) of surface points, for each spacing.
@@ -54,7 +54,7 @@ def build_lattices(
     Args:
         points: of the surface, metres.
         voxels: spacing of each level, metres.
-        radius: how far from the points features exist, metres.
+        radius: how far from the points features exist, metres; of all levels, or of each.
         by_level: points of each level, where they differ: a level may cover some parts of the body only.
 
     Returns:
@@ -62,11 +62,14 @@ def build_lattices(
     """
     rows, places, shapes, positions = [], [], [], []
     count = begin = 0
+    alike = by_level is None and isinstance(radius, float | int)
     for level, voxel in enumerate(voxels):
         points = points if by_level is None else by_level[level]
-        reach = radius + np.sqrt(3) * voxel
-        # Of a part of the body two more layers, which hold no nodes: what lies outside is everywhere else there, too.
-        more = 0.0 if by_level is None else 2 * voxel
+        own = radius if isinstance(radius, float | int) else radius[level]
+        reach = own + np.sqrt(3) * voxel
+        # Of a level that ends before others two more layers, which hold no nodes: what lies outside of the lattice is
+        # everywhere else there, too.
+        more = 0.0 if alike else 2 * voxel
         # In this order: stored features belong to rows that another rounding would change.
         low = points.min(0) - reach - voxel - more
         shape = np.ceil((points.max(0) + reach + voxel + more - low) / voxel).astype(int) + 1
@@ -264,8 +267,9 @@ class FeatureGrid(nn.Module):
     """Several lattices around a canonical body with one feature table, trainable or given."""
 
     def __init__(
-        self, points: Float[np.ndarray, "n 3"], voxels: tuple[float, ...], features: int, radius: float,
-        generator: torch.Generator | None = None, by_level: Sequence[Float[np.ndarray, "_ 3"]] | None = None,
+        self, points: Float[np.ndarray, "n 3"], voxels: tuple[float, ...], features: int,
+        radius: float | Sequence[float], generator: torch.Generator | None = None,
+        by_level: Sequence[Float[np.ndarray, "_ 3"]] | None = None,
     ) -> None:  # fmt: skip
         """Features near zero at the nodes within `radius` metres of `points`, or of those of each level."""
         super().__init__()

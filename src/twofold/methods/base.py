@@ -71,11 +71,13 @@ class ParameterGroup:
         name: for messages.
         rate: learning rate before schedules.
         parameters: may be empty.
+        by_visit: whether a row's moments change only in steps that have a gradient for it (see `RowAdam`).
     """
 
     name: str
     rate: float
     parameters: list[nn.Parameter]
+    by_visit: bool = False
 
 
 @dataclass(frozen=True)

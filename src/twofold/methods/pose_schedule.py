@@ -33,6 +33,9 @@ class PoseConfig:
     refine: tuple[Literal["root", "body", "translation", "shape"], ...] = ("root", "body", "translation", "shape")
     refine_from: int = 0
     """First step at which poses are corrected."""
+    moments: Literal["steps", "visits"] = "steps"
+    """When the moments of a frame's corrections change: "steps", with all others', as in the release; "visits", in
+    steps that see the frame, so that what its images say is averaged (ours; see `twofold.training.row_adam`)."""
     observed_only: bool = False
     """Whether corrections leave directions alone that no training camera of the frame sees (ours; see
     `twofold.deform.observability`)."""

@@ -8,10 +8,10 @@ ABSENT: dict[str, dict[str, object]] = {
     "method": {"late_neighbours": None, "late_from": 100, "normals_by": "posed", "background": "capture"},
     "method.sampler:ErrorBoundedSampler": {"units": "metres", "box": "posed"},
     "method.sampler:ShellSampler": {"leap": 0.0, "finest": 0.0},
-    "method.field:GridFieldConfig": {"detail_voxels": [], "detail_parts": list(DETAILED)},
+    "method.field:GridFieldConfig": {"detail_voxels": [], "detail_parts": list(DETAILED), "finest_radius": None},
     "method.pose": {
         "zero_epochs": 0, "epochs": "moments", "canonical_shape": "refined", "test_shape": "refined",
-        "observed_only": False,
+        "observed_only": False, "moments": "steps",
     },
     "method.losses": {
         "lpips_dropout": 0.0, "lpips_off_box": "black", "s3im_center": 1.5, "eikonal_replacement": True,

@@ -159,9 +159,14 @@ def make_optimizer(
 
     Large tables are updated row by row where a process trains `alone`.
     """
-    groups = [{"params": g.parameters, "lr": g.rate, "name": g.name} for g in avatar.parameter_groups() if g.parameters]
+    groups = [
+        {"params": g.parameters, "lr": g.rate, "name": g.name, "by_visit": g.by_visit}
+        for g in avatar.parameter_groups()
+        if g.parameters
+    ]
     if colors is not None:
-        groups.append({"params": list(colors.parameters()), "lr": RATE, "name": "camera colours"})
+        own = list(colors.parameters())
+        groups.append({"params": own, "lr": RATE, "name": "camera colours", "by_visit": False})
     # Clipping, and the mean over processes, need ordinary gradients.
     rows = avatar.row_gradients(collect=alone and config.clip == 0)
     return RowAdam(groups, rows, config.adam_betas, config.adam_epsilon)

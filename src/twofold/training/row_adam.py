@@ -1,16 +1,21 @@
-"""Adam whose large tables are updated row by row."""
+"""Adam whose large tables are updated row by row, and whose rows may each have moments of their own time."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from twofold.kernels.row_gradient import RowGradient, adam_rows
 
 
 class RowAdam(torch.optim.Adam):
-    """Adam; parameters with a `RowGradient` are updated by it, and make the same steps."""
+    """Adam; parameters with a `RowGradient` are updated by it, and make the same steps.
+
+    In groups marked `by_visit` the moments of a row change only in steps that have a gradient for it. A table of frames
+    of which each step sees one needs that: else the mean of a frame's gradients has long decayed when the frame comes
+    again, each gradient moves it by ten rates whatever its size, and noise is never averaged.
+    """
 
     def __init__(
         self, groups: Iterable[dict[str, Any]], rows: dict[nn.Parameter, RowGradient], betas: tuple[float, float],
@@ -27,6 +32,8 @@ class RowAdam(torch.optim.Adam):
             for parameter in group["params"]:
                 if parameter in self.rows:
                     self._step_rows(parameter, group)
+                elif group.get("by_visit") and parameter.dim() > 1 and parameter.grad is not None:
+                    self._step_visited(parameter, group)
         return super().step(closure)
 
     def _step_rows(self, table: nn.Parameter, group: dict[str, Any]) -> None:
@@ -35,15 +42,34 @@ class RowAdam(torch.optim.Adam):
             # Operations that know nothing of rows leave an ordinary gradient.
             gradient.add(table.grad)
             table.grad = None
+        if not self.state[table] and not gradient.marks.any():
+            return
+        first, second, step = self._advanced(table)
+        adam_rows(table, first, second, gradient, group["lr"], step, group["betas"], group["eps"])
+
+    def _step_visited(self, table: nn.Parameter, group: dict[str, Any]) -> None:
+        gradient, (beta1, beta2) = table.grad, group["betas"]
+        if gradient is None:
+            return
+        first, second, _ = self._advanced(table)
+        count = self.state[table].setdefault("visits", torch.zeros(len(table)))
+        seen = gradient.flatten(1).abs().amax(1).nonzero()[:, 0]
+        g, table.grad = gradient[seen], None
+        count[seen] += 1
+        times = count[seen].view(-1, *[1] * (table.dim() - 1))
+        first[seen] = beta1 * first[seen] + (1 - beta1) * g
+        second[seen] = beta2 * second[seen] + (1 - beta2) * g.square()
+        root = (second[seen] / (1 - beta2**times)).sqrt() + group["eps"]
+        table[seen] -= group["lr"] * first[seen] / (1 - beta1**times) / root
+
+    def _advanced(self, table: nn.Parameter) -> tuple[Tensor, Tensor, int]:
+        """The moments of a table, zero at first, and the number of this step."""
         state = self.state[table]
         if not state:
-            if not gradient.marks.any():
-                return
             state["step"] = torch.zeros((), dtype=torch.float32)
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(table), torch.zeros_like(table)
         state["step"] += 1
-        moments = state["exp_avg"], state["exp_avg_sq"]
-        adam_rows(table, *moments, gradient, group["lr"], int(state["step"]), group["betas"], group["eps"])
+        return state["exp_avg"], state["exp_avg_sq"], int(state["step"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """See `torch.optim.Optimizer.load_state_dict`; rows that have had a gradient are known by their moments."""
