@@ -181,3 +181,26 @@ def test_a_finer_walk_and_a_divided_one_show_the_same_surface(started):
     )
     assert (opaque - divided_opaque).abs().mean() < 0.002
     assert (depth - divided_depth)[opaque > 0.5].abs().quantile(0.95) < 0.002
+
+
+@pytest.mark.parametrize("slack", [0.0, 0.006])
+def test_divided_steps_are_those_of_the_twin_in_torch(started, monkeypatch, slack):
+    avatar, surface, rays = started
+    sampler = replace(avatar._sampler.config, step=0.012, finest=0.003, leap=0.0, min_weight=2e-3, miswarp_slack=slack)
+    placer = sampler.build(avatar.deformation, avatar.canonical_points, avatar.subject.body.faces)
+    query = FieldQuery(BallField(avatar), torch.tensor(0.0025))
+    ours = placer.place(rays, surface, query, True, torch.Generator().manual_seed(1))
+    monkeypatch.setattr(shell_sampler, "can_walk", lambda *_: False)
+    twin = placer.place(rays, surface, query, True, torch.Generator().manual_seed(1))
+    keys = [by_place(placed) for placed in (ours, twin)]
+    both = sorted(set(keys[0]) & set(keys[1]))
+    assert len(both) > 0.98 * max(map(len, keys))
+    assert len(both) > 500
+    here, there = (torch.tensor([table[key] for key in both]) for table in keys)
+    torch.testing.assert_close(ours.x_canonical[here], twin.x_canonical[there], atol=1e-3, rtol=1e-3)
+    assert ours.samples.delta.unique().tolist() == twin.samples.delta.unique().tolist() == pytest.approx([0.004])
+
+
+def test_divided_steps_need_a_least_weight():
+    with pytest.raises(ValueError, match="it needs a min_weight above 0"):
+        ShellSampler(finest=0.003, min_weight=0.0)

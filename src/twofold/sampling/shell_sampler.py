@@ -15,8 +15,9 @@ from twofold.sampling.placement import Deformation, FieldQuery, Placement, place
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.pruning import miswarped, visible
 from twofold.sampling.sdf_grid import SdfGrid, tabulate
-from twofold.sampling.shell import Shell, build_shell, sample_shell
-from twofold.sampling.shell_walk import Walk, can_walk, start_walk
+from twofold.sampling.shell import Shell, build_shell, nearest_listed, sample_shell
+from twofold.sampling.shell_walk import Walk, can_walk, parts_of_step, start_walk
+from twofold.volume.samples import Samples
 
 _GRID_PAYS = 150_000
 """Samples from which on an SDF grid at 15 mm, of some eighty thousand nodes, is the quicker way."""
@@ -42,7 +43,7 @@ class ShellSampler:
     a look at the samples between; 0 looks at every sample. Used on CPUs."""
     finest: float = 0.0
     """Near the surface steps are divided until they are as short as twice the density's scale, down to this, metres; 0
-    leaves them as they are. Used on CPUs."""
+    leaves them as they are."""
     sdf_grid_voxel: float = 0.015
     """Rendering with dense networks: spacing of a grid of signed distances, queried once a pose, that finds most
     samples to be empty or hidden before the networks are queried; metres, 0 queries the networks for every sample."""
@@ -58,6 +59,8 @@ class ShellSampler:
             raise ValueError(f"sdf_grid_voxel={self.sdf_grid_voxel:g} should be 0.004 to 0.5, or 0 for no grid")
         if 0 < self.finest < 5e-4:
             raise ValueError(f"finest={self.finest:g} should be 0.0005 to 0.5, or 0 to leave steps as they are")
+        if self.finest > 0 and self.min_weight == 0:
+            raise ValueError("finest divides the steps of samples that count; it needs a min_weight above 0")
 
     @property
     def reach(self) -> float:
@@ -105,38 +108,72 @@ class ShellPlacer:
         if len(placed.samples) == 0 or least == 0:
             return placed
         grid = None if training else self._grid(len(placed.samples), surface, query)
-        return placed[visible(placed.samples, placed.x_canonical, len(rays), query.distance, query.beta, least, grid)]
+
+        def seen(placed: Placement) -> Placement:
+            return placed[
+                visible(placed.samples, placed.x_canonical, len(rays), query.distance, query.beta, least, grid)
+            ]
+
+        placed = seen(placed)
+        parts = parts_of_step(self.config.step, float(query.beta), self.config.finest)
+        return placed if parts == 1 else seen(self._divided(placed.samples, rays, surface, parts))
 
     @torch.no_grad()
     def well_warped(self, rays: Rays, surface: PosedSurface, generator: torch.Generator | None) -> Placement:
         """`candidates` without those that are mis-warped."""
-        slack, shell = self.config.miswarp_slack, self._shell(surface)
+        shell = self._shell(surface)
         if can_walk(shell, rays):
             return self._walk(shell, rays, surface, generator).whole()
-        placed = self.candidates(rays, surface, generator)
+        return self._without_stray(self.candidates(rays, surface, generator), rays, surface)
+
+    def _without_stray(self, placed: Placement, rays: Rays, surface: PosedSurface) -> Placement:
+        slack = self.config.miswarp_slack
         if slack == 0 or len(placed.samples) == 0:
             return placed
         stray = miswarped(placed, rays, surface, self.canonical_shell(surface.forward.device), slack)
         return placed[(~stray).nonzero()[:, 0]]
 
+    @torch.no_grad()
+    def _divided(self, samples: Samples, rays: Rays, surface: PosedSurface, parts: int) -> Placement:
+        """`parts` samples evenly spread over the step of each of these."""
+        shell, step = self._shell(surface), self.config.step / parts
+        middles = (torch.arange(parts, device=samples.depth.device) + 0.5 - parts / 2).to(samples.depth)
+        depth = (samples.depth[:, None] + step * middles).flatten()
+        index = samples.ray_index.repeat_interleave(parts)
+        fine = Samples(index, depth, torch.full_like(depth, step))
+        points = fine.points(rays)
+        rows = shell.rows_at(points)
+        inside = ((rows >= 0) & (depth >= rays.near[index]) & (depth < rays.far[index])).nonzero()[:, 0]
+        nearest, squared = nearest_listed(shell, points[inside], rows[inside], surface.neighbours)
+        close = squared[:, 0] < self._limit**2
+        placed = self._placed(fine[inside[close]], nearest[close], squared[close], rays, surface)
+        return self._without_stray(placed, rays, surface)
+
+    def _placed(
+        self, samples: Samples, nearest: Tensor, squared: Tensor, rays: Rays, surface: PosedSurface
+    ) -> Placement:
+        outlier = torch.zeros(len(samples), dtype=torch.bool, device=squared.device)
+        return placement(samples, rays, nearest, self.deformation.weigh(squared), outlier, surface)
+
+    @property
+    def _limit(self) -> float:
+        """How far from the nearest vertex samples are placed, metres."""
+        return min(self.config.radius, self.deformation.outlier_distance)
+
     def _walk(self, shell: Shell, rays: Rays, surface: PosedSurface, generator: torch.Generator | None) -> Walk:
         slack = self.config.miswarp_slack
         canonical = self.canonical_shell(surface.forward.device) if slack > 0 else shell
-        limit = min(self.config.radius, self.deformation.outlier_distance)
         return start_walk(
-            shell, rays, self.config.step, generator, limit, surface.neighbours, self.deformation, surface.forward,
-            canonical, slack, self._spacing,
+            shell, rays, self.config.step, generator, self._limit, surface.neighbours, self.deformation,
+            surface.forward, canonical, slack, self._spacing,
         )  # fmt: skip
 
     @torch.no_grad()
     def candidates(self, rays: Rays, surface: PosedSurface, generator: torch.Generator | None) -> Placement:
         """Every sample of the rays in the shell; a generator jitters each ray's evenly spaced samples together."""
-        deformation = self.deformation
-        limit = min(self.config.radius, deformation.outlier_distance)
-        shell = self._shell(surface)
-        samples, nearest, squared = sample_shell(shell, rays, self.config.step, generator, limit, surface.neighbours)
-        outlier = torch.zeros(len(samples), dtype=torch.bool, device=squared.device)
-        return placement(samples, rays, nearest, deformation.weigh(squared), outlier, surface)
+        shell, step = self._shell(surface), self.config.step
+        samples, nearest, squared = sample_shell(shell, rays, step, generator, self._limit, surface.neighbours)
+        return self._placed(samples, nearest, squared, rays, surface)
 
     def _shell(self, surface: PosedSurface) -> Shell:
         """The body's shell; it may have been built before the body's last small corrections."""

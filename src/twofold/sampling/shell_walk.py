@@ -31,6 +31,22 @@ def can_walk(shell: Shell, rays: Rays) -> bool:
     return shell.nearest.shape[1] <= LANES and all(t.dtype == torch.float32 and not t.is_cuda for t in own)
 
 
+def parts_of_step(step: float, beta: float, finest: float) -> int:
+    r"""Into how many parts a step near the surface is divided: none is longer than twice the scale of the density.
+
+    \[ n = \lceil \delta / \max(2 \beta, \delta_{\min}) \rceil \]
+
+    >>> [parts_of_step(0.01, beta, 0.0025) for beta in (0.01, 0.003, 0.0001)], parts_of_step(0.01, 0.003, 0)
+    ([1, 2, 4], 1)
+
+    Args:
+        step: $\delta$, metres.
+        beta: scale of the density, metres.
+        finest: $\delta_{\min}$, metres; 0 leaves the step as it is.
+    """
+    return max(1, math.ceil(step / max(2 * beta, finest) - 1e-6)) if finest else 1
+
+
 @dataclass(frozen=True)
 class Walk:
     """Where rays run through a shell, and what maps its points to canonical space.
@@ -76,8 +92,8 @@ class Walk:
                 0 leaves them.
         """
         coarse = self._search(query, least, share)
-        parts = math.ceil(self.step / max(2 * float(query.beta), finest) - 1e-6) if finest else 1
-        if parts <= 1 or len(coarse[0]) == 0:
+        parts = parts_of_step(self.step, float(query.beta), finest)
+        if parts == 1 or len(coarse[0]) == 0:
             return self._placement(*coarse)
         shell, rays = self.given[0], self.given[1]
         on_rays = walk_kernels.divide(shell, rays, self.on_rays, coarse[0], parts)
