@@ -227,6 +227,20 @@ def plus(typing_context: Any, a: Any, b: Any) -> Any:
     return a(a, a), generate
 
 
+@_operation
+def over_root(typing_context: Any, a: Any, square: Any, scale: Any, epsilon: Any) -> Any:
+    """a / (scale sqrt(square) + epsilon)."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kind = args[0].type
+        name, signature = f"llvm.sqrt.v{kind.count}f32", ir.FunctionType(kind, [kind])
+        rooted = builder.call(cgutils.get_or_insert_function(builder.module, signature, name), [args[1]])
+        scaled = builder.fmul(_filled(builder, args[2], kind.count), rooted)
+        return builder.fdiv(args[0], builder.fadd(scaled, _filled(builder, args[3], kind.count)))
+
+    return a(a, a, types.float32, types.float32), generate
+
+
 _LOG2_E = 1.4426950408889634
 _LN2_HIGH, _LN2_LOW = 0.693359375, -2.12194440e-4
 _EXPONENTIAL = (1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1)

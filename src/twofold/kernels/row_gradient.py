@@ -13,10 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from twofold.kernels.lanes import LANES, fill, load, minus, over_root, scaled, scaled_plus, store, times_plus
 from twofold.kernels.parallel import compiled, in_parts
 
 NEVER, BEFORE, NOW = 0, 1, 2
 """A row that had no gradient yet; that had one in an earlier step; that has one in this step."""
+_ZERO = np.float32(0)
 
 
 @dataclass(frozen=True)
@@ -80,24 +82,41 @@ def adam_rows(
     """
     size, root = rate / (1 - betas[0] ** step), (1 - betas[1] ** step) ** 0.5
     numbers = (np.float32(value) for value in (size, 1 - betas[0], betas[1], 1 - betas[1], root, epsilon))
-    arrays = (t.detach().numpy() for t in (table, first, second))
-    given = (*arrays, gradient.values, gradient.marks, *numbers)
-    in_parts(len(table), lambda begin, end: _adam_rows(*given, begin, end), least=65_536)
+    arrays = [t.detach().numpy().reshape(1, -1) for t in (table, first, second)]
+    given = (*arrays, gradient.values.reshape(1, -1), gradient.marks, table.shape[1], *numbers)
+    blocks = -(-len(table) // LANES)
+    in_parts(blocks, lambda begin, end: _adam_blocks(*given, begin, end), least=4096)
 
 
 @compiled
-def _adam_rows(table, first, second, gradient, marks, size, rest1, beta2, rest2, root, epsilon, begin, end):  # noqa: ANN001, ANN202
-    for row in range(begin, end):
-        mark = marks[row]
+def _adam_blocks(p, m, v, g, marks, width, size, rest1, beta2, rest2, root, epsilon, begin, end):  # noqa: ANN001, ANN202
+    """Steps of the rows of some blocks of sixteen; all arrays but `marks` flat, [1 NC].
+
+    Rows beside each other are nodes beside each other, which mostly all have a gradient or none. So a block is updated
+    as a whole, which leaves its rows without one as they are.
+    """
+    scale = np.float32(1) / root
+    for block in range(begin, end):
+        first, last = block * LANES, min((block + 1) * LANES, marks.shape[0])
+        mark = 0
+        for row in range(first, last):
+            mark |= marks[row]
         if mark == 0:
             continue
-        for c in range(table.shape[1]):
-            g = gradient[row, c]
-            m = first[row, c] + rest1 * (g - first[row, c])
-            v = second[row, c] * beta2 + rest2 * g * g
-            first[row, c], second[row, c] = m, v
-            table[row, c] -= size * m / (np.sqrt(v) / root + epsilon)
-        if mark == 2:
-            for c in range(table.shape[1]):
-                gradient[row, c] = np.float32(0)
-            marks[row] = 1
+        if last - first == LANES:
+            for at in range(first * width, last * width, LANES):
+                slope = load(g, 0, at)
+                mean = scaled_plus(rest1, minus(slope, load(m, 0, at)), load(m, 0, at))
+                square = scaled_plus(beta2, load(v, 0, at), scaled(rest2, times_plus(slope, slope, fill(_ZERO))))
+                store(m, 0, at, mean)
+                store(v, 0, at, square)
+                store(p, 0, at, scaled_plus(-size, over_root(mean, square, scale, epsilon), load(p, 0, at)))
+                store(g, 0, at, fill(_ZERO))
+        else:
+            for at in range(first * width, last * width):
+                m[0, at] += rest1 * (g[0, at] - m[0, at])
+                v[0, at] = v[0, at] * beta2 + rest2 * g[0, at] * g[0, at]
+                p[0, at] -= size * m[0, at] / (np.sqrt(v[0, at]) * scale + epsilon)
+                g[0, at] = _ZERO
+        for row in range(first, last):
+            marks[row] = min(marks[row], BEFORE)

@@ -72,12 +72,14 @@ class ParameterGroup:
         rate: learning rate before schedules.
         parameters: may be empty.
         by_visit: whether a row's moments change only in steps that have a gradient for it (see `RowAdam`).
+        decay_power: power of what the schedule multiplies all rates with; 2 lets this one fall twice as fast.
     """
 
     name: str
     rate: float
     parameters: list[nn.Parameter]
     by_visit: bool = False
+    decay_power: float = 1.0
 
 
 @dataclass(frozen=True)

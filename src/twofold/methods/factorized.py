@@ -96,11 +96,8 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
         """The field's groups, "beta" and "pose"."""
         pose = [p for p in self.refinement.parameters() if p.requires_grad]
         groups = {**self.field.parameter_groups(), "beta": [self.raw_beta], "pose": pose}
-        visits = self.config.pose.moments == "visits"
-        return [
-            ParameterGroup(name, getattr(self.config.rates, name), group, by_visit=visits and name == "pose")
-            for name, group in groups.items()
-        ]
+        rates = self.config.rates
+        return [self.config.pose.group(name, getattr(rates, name), group) for name, group in groups.items()]
 
     def row_gradients(self, collect: bool) -> dict[nn.Parameter, RowGradient]:
         """See `Avatar.row_gradients`: the tables of feature grids."""

@@ -6,10 +6,11 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from twofold.config import require_within
 from twofold.losses import MAX_STEPS
+from twofold.methods.base import ParameterGroup
 from twofold.recipe import scaled_count
 
 
@@ -36,6 +37,9 @@ class PoseConfig:
     moments: Literal["steps", "visits"] = "steps"
     """When the moments of a frame's corrections change: "steps", with all others', as in the release; "visits", in
     steps that see the frame, so that what its images say is averaged (ours; see `twofold.training.row_adam`)."""
+    decay_power: float = 1.0
+    """Power of what the schedule multiplies the learning rate of the corrections with; 2 lets it fall twice as fast as
+    the others (ours)."""
     observed_only: bool = False
     """Whether corrections leave directions alone that no training camera of the frame sees (ours; see
     `twofold.deform.observability`)."""
@@ -47,7 +51,21 @@ class PoseConfig:
     def __post_init__(self) -> None:
         """Refuses chances and steps that there are not."""
         steps = (0, MAX_STEPS)
-        require_within(self, zero_until=steps, zero_epochs=steps, zero_every=steps, drop=(0, 1), refine_from=steps)
+        require_within(
+            self,
+            zero_until=steps,
+            zero_epochs=steps,
+            zero_every=steps,
+            drop=(0, 1),
+            refine_from=steps,
+            decay_power=(0, 10),
+        )
+
+    def group(self, name: str, rate: float, parameters: list[nn.Parameter]) -> ParameterGroup:
+        """A group of a method's parameters; that of the corrections, named "pose", as is asked for here."""
+        if name != "pose":
+            return ParameterGroup(name, rate, parameters)
+        return ParameterGroup(name, rate, parameters, self.moments == "visits", self.decay_power)
 
     def scaled(self, factor: float) -> "PoseConfig":
         """The schedule stretched by a factor; zero poses later on keep their share of the epochs."""

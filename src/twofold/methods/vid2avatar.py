@@ -164,11 +164,8 @@ class Vid2Avatar(SkinnedAvatar[Vid2AvatarConfig, ImplicitField]):
         scene = [] if self.scene is None else [*self.scene.parameters(), self.codes]
         pose = [p for p in self.refinement.parameters() if p.requires_grad]
         groups = {"networks": [*self.field.parameters()], "scene": scene, "beta": [self.raw_beta], "pose": pose}
-        visits = self.config.pose.moments == "visits"
-        return [
-            ParameterGroup(name, getattr(self.config.rates, name), group, by_visit=visits and name == "pose")
-            for name, group in groups.items()
-        ]
+        rates = self.config.rates
+        return [self.config.pose.group(name, getattr(rates, name), group) for name, group in groups.items()]
 
     def background(
         self, color: Float[Tensor, "3"], rays: int, generator: torch.Generator

@@ -160,7 +160,7 @@ def make_optimizer(
     Large tables are updated row by row where a process trains `alone`.
     """
     groups = [
-        {"params": g.parameters, "lr": g.rate, "name": g.name, "by_visit": g.by_visit}
+        {"params": g.parameters, "lr": g.rate, "name": g.name, "by_visit": g.by_visit, "decay_power": g.decay_power}
         for g in avatar.parameter_groups()
         if g.parameters
     ]
@@ -354,7 +354,7 @@ class _Run:
         self.avatar.before_step(mode)
         factor = rate_factor(config, within, len(self.capture.train))
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
-            group["lr"] = rate * factor
+            group["lr"] = rate * factor ** group["decay_power"]
         terms, error = self.module(self.step, mode, self.team)
         self.optimizer.zero_grad(set_to_none=True)
         losses.total(terms).backward()
