@@ -114,7 +114,7 @@ def quick() -> Recipe:
         name="quick",
         method=FactorizedConfig(
             field=GridFieldConfig(),
-            sampler=ShellSampler(radius=0.06, step=0.01, min_weight=2e-3, miswarp_slack=0.006),
+            sampler=ShellSampler(radius=0.06, step=0.01, min_weight=2e-3, miswarp_slack=0.006, finest=0.0025),
             losses=LossConfig(
                 eikonal=0.05,
                 mask=0.3,
@@ -132,6 +132,7 @@ def quick() -> Recipe:
                 zero_every=0,
                 drop=0.2,
                 refine_from=200,
+                moments="visits",
                 canonical_shape="refined",
                 test_shape="refined",
                 observed_only=True,
