@@ -1,6 +1,6 @@
 """How sharp an avatar is after a given training: PSNR and error of image gradients on unseen views of large images.
 
-python -m benchmarks.sharpness --steps 2400 [--seeds 3 4 5] [--size 512] [--threads 1] [--settings K=V ...] [--name NAME]
+python -m benchmarks.sharpness --steps 2400 [--seeds 3 4 5] [--size 512] [--threads 1] [--settings K=V] [--name NAME]
 
 Another commit is measured with this file, too: `PYTHONPATH=OTHER/src python -m benchmarks.sharpness ...`.
 """

@@ -115,7 +115,7 @@ class ShellPlacer:
             ]
 
         placed = seen(placed)
-        parts = parts_of_step(self.config.step, float(query.beta), self.config.finest)
+        parts = parts_of_step(self.config.step, float(query.beta.detach()), self.config.finest)
         return placed if parts == 1 else seen(self._divided(placed.samples, rays, surface, parts))
 
     @torch.no_grad()

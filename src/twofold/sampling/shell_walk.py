@@ -92,7 +92,7 @@ class Walk:
                 0 leaves them.
         """
         coarse = self._search(query, least, share)
-        parts = parts_of_step(self.step, float(query.beta), finest)
+        parts = parts_of_step(self.step, float(query.beta.detach()), finest)
         if parts == 1 or len(coarse[0]) == 0:
             return self._placement(*coarse)
         shell, rays = self.given[0], self.given[1]
@@ -133,7 +133,7 @@ class Walk:
     ) -> np.ndarray:
         """Which of these candidates add more than `least`; the light left on each ray is reduced by all of them."""
         number, away = found[0], np.sqrt(np.maximum(found[_GOOD - 1] ** 2 - np.float32(self.spacing**2), 0))
-        beta, seen, none = float(query.beta), np.empty(len(number), bool), np.zeros(0, np.int64)
+        beta, seen, none = float(query.beta.detach()), np.empty(len(number), bool), np.zeros(0, np.int64)
         sdf = query.distance(torch.from_numpy(found[3])).float().contiguous().numpy()
         guard = max(beta * math.log(self.step / (2 * beta * least)), 0.0)
         share, place, ends = leap or (0.0, none, none)
