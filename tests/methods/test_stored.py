@@ -48,10 +48,12 @@ def test_quick_of_then_is_quick_of_now_but_for_these_settings():
     read = recipe_from_dict(stored, "here")
     losses = dataclasses.replace(read.method.losses, base_mask=0.3)  # since then the base branch has a mask term
     # Since then corrections leave alone what no camera sees, and average what a frame's images say.
-    pose = dataclasses.replace(read.method.pose, observed_only=True, moments="visits")
+    pose = dataclasses.replace(read.method.pose, observed_only=True, averages="visits")
     # Since then rays leap through empty space, and steps near the surface are divided.
     sampler = dataclasses.replace(read.method.sampler, leap=0.7, finest=quick().method.sampler.finest)
-    method = dataclasses.replace(read.method, losses=losses, pose=pose, sampler=sampler).completing(on=True)
+    rates = dataclasses.replace(read.method.rates, pose=1e-3)
+    method = dataclasses.replace(read.method, losses=losses, pose=pose, sampler=sampler, rates=rates)
+    method = method.completing(on=True)
     assert dataclasses.replace(read, method=method) == quick()
 
 

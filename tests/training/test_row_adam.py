@@ -120,8 +120,8 @@ def test_noise_moves_a_frame_less_by_visits_than_by_steps():
 
 def test_quick_and_vid2avatar_ask_for_visits_of_poses_where_the_recipe_does(person):
     for name in ("quick", "vid2avatar"):
-        for moments in ("steps", "visits"):
+        for averages in ("steps", "visits"):
             method = CASES[name].method
-            avatar = replace(method, pose=replace(method.pose, moments=moments)).build(Subject.of(person), 0)
+            avatar = replace(method, pose=replace(method.pose, averages=averages)).build(Subject.of(person), 0)
             asked = {group.name for group in avatar.parameter_groups() if group.by_visit}
-            assert asked == ({"pose"} if moments == "visits" else set())
+            assert asked == ({"pose"} if averages == "visits" else set())

@@ -44,10 +44,10 @@ class RowGradient:
         self.values[:] += values
         self.marks[values.any(1)] = NOW
 
-    def know(self, moments: Float[Tensor, "N C"]) -> None:
-        """Takes the rows that have had a gradient from an optimizer's second moments; none has one now."""
+    def know(self, squares: Float[Tensor, "N C"]) -> None:
+        """Takes the rows that have had a gradient from Adam's mean squares; none has one now."""
         self.values[:] = 0
-        self.marks[:] = np.where(moments.detach().numpy().any(1), BEFORE, NEVER)
+        self.marks[:] = np.where(squares.detach().numpy().any(1), BEFORE, NEVER)
 
 
 @torch.no_grad()

@@ -71,7 +71,7 @@ class ParameterGroup:
         name: for messages.
         rate: learning rate before schedules.
         parameters: may be empty.
-        by_visit: whether a row's moments change only in steps that have a gradient for it (see `RowAdam`).
+        by_visit: whether Adam's means of a row change only in steps that have a gradient for it (see `RowAdam`).
         decay_power: power of what the schedule multiplies all rates with; 2 lets this one fall twice as fast.
     """
 

@@ -34,9 +34,9 @@ class PoseConfig:
     refine: tuple[Literal["root", "body", "translation", "shape"], ...] = ("root", "body", "translation", "shape")
     refine_from: int = 0
     """First step at which poses are corrected."""
-    moments: Literal["steps", "visits"] = "steps"
-    """When the moments of a frame's corrections change: "steps", with all others', as in the release; "visits", in
-    steps that see the frame, so that what its images say is averaged (ours; see `twofold.training.row_adam`)."""
+    averages: Literal["steps", "visits"] = "steps"
+    """When Adam's running means of a frame's gradients change: "steps", in all, as in the release; "visits", in steps
+    that see the frame, so that what its images say is averaged (ours; see `twofold.training.row_adam`)."""
     decay_power: float = 1.0
     """Power of what the schedule multiplies the learning rate of the corrections with; 2 lets it fall twice as fast as
     the others (ours)."""
@@ -65,7 +65,7 @@ class PoseConfig:
         """A group of a method's parameters; that of the corrections, named "pose", as is asked for here."""
         if name != "pose":
             return ParameterGroup(name, rate, parameters)
-        return ParameterGroup(name, rate, parameters, self.moments == "visits", self.decay_power)
+        return ParameterGroup(name, rate, parameters, self.averages == "visits", self.decay_power)
 
     def scaled(self, factor: float) -> "PoseConfig":
         """The schedule stretched by a factor; zero poses later on keep their share of the epochs."""

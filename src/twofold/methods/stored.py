@@ -11,7 +11,7 @@ ABSENT: dict[str, dict[str, object]] = {
     "method.field:GridFieldConfig": {"detail_voxels": [], "detail_parts": list(DETAILED), "finest_radius": None},
     "method.pose": {
         "zero_epochs": 0, "epochs": "moments", "canonical_shape": "refined", "test_shape": "refined",
-        "observed_only": False, "moments": "steps", "decay_power": 1.0,
+        "observed_only": False, "averages": "steps", "decay_power": 1.0,
     },
     "method.losses": {
         "lpips_dropout": 0.0, "lpips_off_box": "black", "s3im_center": 1.5, "eikonal_replacement": True,

@@ -36,7 +36,7 @@ def parts_of_step(step: float, beta: float, finest: float) -> int:
 
     \[ n = \lceil \delta / \max(2 \beta, \delta_{\min}) \rceil \]
 
-    >>> [parts_of_step(0.01, beta, 0.0025) for beta in (0.01, 0.003, 0.0001)], parts_of_step(0.01, 0.003, 0)
+    >>> [parts_of_step(0.01, beta, 0.0025) for beta in (0.01, 0.003, 0.0001)], parts_of_step(0.01, 0.003, 0.0)
     ([1, 2, 4], 1)
 
     Args:

@@ -1,4 +1,4 @@
-"""Adam whose large tables are updated row by row, and whose rows may each have moments of their own time."""
+"""Adam whose large tables are updated row by row, and whose rows may each have means of their own."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -12,9 +12,9 @@ from twofold.kernels.row_gradient import RowGradient, adam_rows
 class RowAdam(torch.optim.Adam):
     """Adam; parameters with a `RowGradient` are updated by it, and make the same steps.
 
-    In groups marked `by_visit` the moments of a row change only in steps that have a gradient for it. A table of frames
-    of which each step sees one needs that: else the mean of a frame's gradients has long decayed when the frame comes
-    again, each gradient moves it by ten rates whatever its size, and noise is never averaged.
+    In groups marked `by_visit` the means of a row's gradients change only in steps that have a gradient for it. A table
+    of frames of which each step sees one needs that: else the mean of a frame's gradients has long decayed when the
+    frame comes again, each gradient moves it by ten rates whatever its size, and noise is never averaged.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class RowAdam(torch.optim.Adam):
         table[seen] -= group["lr"] * first[seen] / (1 - beta1**times) / root
 
     def _advanced(self, table: nn.Parameter) -> tuple[Tensor, Tensor, int]:
-        """The moments of a table, zero at first, and the number of this step."""
+        """The means of a table's gradients and of their squares, zero at first, and the number of this step."""
         state = self.state[table]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32)
@@ -72,7 +72,7 @@ class RowAdam(torch.optim.Adam):
         return state["exp_avg"], state["exp_avg_sq"], int(state["step"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """See `torch.optim.Optimizer.load_state_dict`; rows that have had a gradient are known by their moments."""
+        """See `torch.optim.Optimizer.load_state_dict`; rows that had a gradient are known by their squares."""
         super().load_state_dict(state_dict)
         for table, gradient in self.rows.items():
             if self.state[table]:
