@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks import sharpness_section
 from benchmarks.methods_section import schedules, side_by_side
 from benchmarks.study_section import answer, section
 
@@ -77,6 +78,7 @@ def results_page(results: dict[str, Any]) -> str:
         "loops were last changed. `python -m benchmarks.rendering`.\n\n" + _rendering(_named(results, "rendering-")),
         "## Quality against time\n\nSynthetic subject, one training camera; PSNR over the subject's box. "
         "`python -m benchmarks.quality`.\n\n" + _quality(_named(results, "quality-")),
+        *sharpness_section.section(results, _table),
         *_completions(_named(results, "completion-", "")),
         PICTURES,
     ]
