@@ -28,8 +28,8 @@ from twofold.losses import total
 from twofold.methods.base import Avatar, Mode
 from twofold.methods.subject import Subject
 from twofold.methods.table import METHODS, RECIPES
-from twofold.training.loop import make_optimizer
 from twofold.training.pixels import PixelSource
+from twofold.training.row_adam import make_optimizer
 from twofold.training.run import find_capture, load
 
 NAME = "method-steps-cpu-1threads"

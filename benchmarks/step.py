@@ -23,8 +23,8 @@ from twofold.methods.factorized import FactorizedConfig
 from twofold.methods.factorized_recipes import fast, quick, released
 from twofold.methods.subject import Subject
 from twofold.recipe import Recipe
-from twofold.training.loop import make_optimizer
 from twofold.training.pixels import PixelSource
+from twofold.training.row_adam import make_optimizer
 
 
 def reference() -> Recipe:

@@ -29,7 +29,7 @@ from twofold.prepare.detect.mask_files import read_mask
 from twofold.prepare.fitting.pose_files import poses_from_file
 from twofold.prepare.video.frames import Frames, describe
 from twofold.training.curves import Curves
-from twofold.training.loop import make_optimizer
+from twofold.training.row_adam import make_optimizer
 from twofold.training.run import (
     find_capture,
     load_optimizer,

@@ -15,7 +15,7 @@ def trained(person, recipe, folder, steps, monkeypatch, rows=True, resume=False)
     with monkeypatch.context() as patch:
         if not rows:
             make = loop.make_optimizer
-            patch.setattr(loop, "make_optimizer", lambda avatar, config, alone: make(avatar, config, alone=False))
+            patch.setattr(loop, "make_optimizer", lambda avatar, config, *_: make(avatar, config, alone=False))
         recipe = replace(recipe, training=replace(recipe.training, steps=steps, checkpoint_every=3, decay=1.0))
         return loop.train(person, recipe, folder, torch.device("cpu"), resume=resume).state_dict()
 

@@ -13,7 +13,7 @@ from twofold.config import with_overrides
 from twofold.errors import TwofoldError
 from twofold.methods.factorized_recipes import quick, released
 from twofold.methods.subject import Subject
-from twofold.training.loop import make_optimizer
+from twofold.training.row_adam import make_optimizer
 from twofold.training.run import (
     choose_device,
     find_capture,

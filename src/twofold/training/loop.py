@@ -22,13 +22,13 @@ from twofold.methods.base import Avatar, Mode, Stage
 from twofold.methods.subject import Subject
 from twofold.recipe import Recipe, TrainingConfig
 from twofold.sampling.joint_box import RELEASED_MARGIN, RELEASED_SLACK
-from twofold.training.camera_colors import RATE, CameraColors, LearnedResponse, load_camera_colors
+from twofold.training.camera_colors import CameraColors, LearnedResponse, load_camera_colors
 from twofold.training.clock import Clock
 from twofold.training.curves import Curves
 from twofold.training.lock import locked
 from twofold.training.pixels import PixelSource
 from twofold.training.processes import Team, joined
-from twofold.training.row_adam import RowAdam
+from twofold.training.row_adam import make_optimizer
 from twofold.training.run import (
     CHECKPOINT,
     load_optimizer,
@@ -150,26 +150,6 @@ def rate_factor(config: TrainingConfig, step: int, frames: int) -> float:
     if config.decay != 1.0 and step > begin:
         factor *= config.decay ** ((step - begin) / max(config.steps - begin, 1))
     return factor
-
-
-def make_optimizer(
-    avatar: Avatar, config: TrainingConfig, colors: CameraColors | None = None, alone: bool = True
-) -> torch.optim.Optimizer:
-    """Adam with one learning rate a parameter group, the training cameras' colours last.
-
-    Large tables are updated row by row where a process trains `alone`.
-    """
-    groups = [
-        {"params": g.parameters, "lr": g.rate, "name": g.name, "by_visit": g.by_visit, "decay_power": g.decay_power}
-        for g in avatar.parameter_groups()
-        if g.parameters
-    ]
-    if colors is not None:
-        own = list(colors.parameters())
-        groups.append({"params": own, "lr": RATE, "name": "camera colours", "by_visit": False})
-    # Clipping, and the mean over processes, need ordinary gradients.
-    rows = avatar.row_gradients(collect=alone and config.clip == 0)
-    return RowAdam(groups, rows, config.adam_betas, config.adam_epsilon)
 
 
 def wants_compiling(config: TrainingConfig, device: torch.device) -> bool:

@@ -7,6 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from twofold.kernels.row_gradient import RowGradient, adam_rows
+from twofold.methods.base import Avatar
+from twofold.recipe import TrainingConfig
+from twofold.training.camera_colors import RATE, CameraColors
 
 
 class RowAdam(torch.optim.Adam):
@@ -77,3 +80,23 @@ class RowAdam(torch.optim.Adam):
         for table, gradient in self.rows.items():
             if self.state[table]:
                 gradient.know(self.state[table]["exp_avg_sq"])
+
+
+def make_optimizer(
+    avatar: Avatar, config: TrainingConfig, colors: CameraColors | None = None, alone: bool = True
+) -> torch.optim.Optimizer:
+    """Adam with one learning rate a parameter group, the training cameras' colours last.
+
+    Large tables are updated row by row where a process trains `alone`.
+    """
+    groups = [
+        {"params": g.parameters, "lr": g.rate, "name": g.name, "by_visit": g.by_visit, "decay_power": g.decay_power}
+        for g in avatar.parameter_groups()
+        if g.parameters
+    ]
+    if colors is not None:
+        own = list(colors.parameters())
+        groups.append({"params": own, "lr": RATE, "name": "camera colours", "by_visit": False, "decay_power": 1.0})
+    # Clipping, and the mean over processes, need ordinary gradients.
+    rows = avatar.row_gradients(collect=alone and config.clip == 0)
+    return RowAdam(groups, rows, config.adam_betas, config.adam_epsilon)
