@@ -35,7 +35,7 @@ def completed(recipe: dict[str, object]) -> dict[str, object]:
     """A stored recipe with the settings that were not there when it was written.
 
     >>> completed({"training": {"steps": 5}, "method": {"kind": "Another"}})
-    {'training': {'epochs': 'images', 'steps': 5}, 'method': {'kind': 'Another'}}
+    {'training': {'epochs': 'images', 'camera_colors': 'off', 'steps': 5}, 'method': {'kind': 'Another'}}
     """
     for place, settings in ABSENT.items():
         path, _, kind = place.partition(":")
