@@ -127,7 +127,8 @@ def test_samples_seen_on_the_way_are_the_visible_ones_of_all(started, beta, radi
     for name in ("nearest", "weights", "x_canonical", "inverse"):
         torch.testing.assert_close(getattr(ours, name)[here], getattr(wanted, name)[there])
     assert (ours.samples.ray_index.diff() >= 0).all()
-    assert asked.asked <= all_asked.asked
+    # Further from a soft surface rays are followed in stretches, some samples of which turn out to be no samples.
+    assert asked.asked <= (1.01 if beta > 0.005 else 1) * all_asked.asked
 
 
 @pytest.mark.parametrize(("beta", "radius"), [(0.002, 0.01), (0.003, 0.02)])

@@ -65,7 +65,7 @@ class FusedField:
         def sdf(x: Tensor) -> Tensor:
             out = torch.empty(len(x))
             given = (x.contiguous().numpy(), *arrays, out.numpy())
-            in_parts(len(x), lambda begin, end: kernels.distances(*given, begin, end))
+            in_parts(len(x), lambda begin, end: kernels.distances(*given, begin, end), least=256)
             return out
 
         return sdf

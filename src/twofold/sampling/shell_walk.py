@@ -19,6 +19,10 @@ from twofold.volume.samples import Samples
 
 _PATIENCE = 3
 """Rounds after which the few rays that are left look at one more candidate in each round."""
+_STRETCH = 8
+"""Candidates of the first round where rays do not leap; each further round takes so many more."""
+_FEW = 256
+"""Candidates that are worth a thread of their own: a round of a training step has about a thousand."""
 _Leap = tuple[float, np.ndarray, np.ndarray]
 """Share of the distance to the surface that a ray leaps over; each ray's next candidate, and where these end."""
 _GOOD = 6
@@ -114,7 +118,13 @@ class Walk:
         through = np.ones(len(place), np.float32)
         index, limit = np.empty(len(ray_at), np.int64), np.float32(least)
         kept, rounds = list[list[np.ndarray]](), 0
-        while count := visibility_kernels.next_on_rays(place, ends, through, limit, 1 + rounds // _PATIENCE, index):
+        # Where nothing of the shell is far enough from the surface to leap from, short rounds save nothing.
+        leaping = self._guard(query, least) < self.given[3] / 2
+        while True:
+            length = 1 + rounds // _PATIENCE if leaping else _STRETCH * (1 + rounds)
+            count = visibility_kernels.next_on_rays(place, ends, through, limit, length, index)
+            if count == 0:
+                break
             rounds += 1
             *found, too_far, excess = self._mapped(index[:count])
             if share > 0 and len(too_far):
@@ -133,19 +143,24 @@ class Walk:
     ) -> np.ndarray:
         """Which of these candidates add more than `least`; the light left on each ray is reduced by all of them."""
         number, away = found[0], np.sqrt(np.maximum(found[_GOOD - 1] ** 2 - np.float32(self.spacing**2), 0))
-        beta, seen, none = float(query.beta.detach()), np.empty(len(number), bool), np.zeros(0, np.int64)
+        beta, seen, none = query.beta.detach(), np.empty(len(number), bool), np.zeros(0, np.int64)
         sdf = query.distance(torch.from_numpy(found[3])).float().contiguous().numpy()
-        guard = max(beta * math.log(self.step / (2 * beta * least)), 0.0)
+        guard = self._guard(query, least)
         share, place, ends = leap or (0.0, none, none)
         light = np.float32(beta), np.float32(self.step), through, np.float32(least), seen
         leaping = np.float32(share), np.float32(guard), place, ends
         visibility_kernels.follow_to_surface(number, *self.on_rays[:2], sdf, away, *light, *leaping)
         return seen
 
+    def _guard(self, query: FieldQuery, least: float) -> float:
+        """How far from the surface samples count, metres; see `seen`."""
+        beta = float(query.beta.detach())
+        return max(beta * math.log(self.step / (2 * beta * least)), 0.0)
+
     def _mapped(self, index: np.ndarray) -> list[np.ndarray]:
         """What `walk_kernels.map_candidates` says of these."""
         given = (*self.given, self.on_rays, index)
-        parts = in_parts(len(index), lambda begin, end: walk_kernels.map_candidates(*given, begin, end))
+        parts = in_parts(len(index), lambda begin, end: walk_kernels.map_candidates(*given, begin, end), least=_FEW)
         return list(parts[0]) if len(parts) == 1 else [np.concatenate(part) for part in zip(*parts, strict=True)]
 
     def _placement(
