@@ -20,7 +20,7 @@ from twofold.volume.samples import Samples
 _PATIENCE = 3
 """Rounds after which the few rays that are left look at one more candidate in each round."""
 _STRETCH = 8
-"""Candidates of the first round where rays do not leap; each further round takes so many more."""
+"""Candidates of the first round where rays do not leap; the next rounds take two, three times this number."""
 _FEW = 256
 """Candidates that are worth a thread of their own: a round of a training step has about a thousand."""
 _Leap = tuple[float, np.ndarray, np.ndarray]
