@@ -53,10 +53,7 @@ class FusedField:
     @torch.no_grad()
     def sdf(self, x: Float[Tensor, "S 3"]) -> Float[Tensor, "S"]:
         """Signed distance alone, metres; without gradients."""
-        out = torch.empty(len(x))
-        given = (_array(x), *self.arrays(), out.numpy())
-        in_parts(len(x), lambda begin, end: kernels.distances(*given, begin, end))
-        return out
+        return self.prepared()(x)
 
     def prepared(self) -> Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]:
         """`sdf` for many small sets of points, while no parameter changes."""
@@ -64,7 +61,7 @@ class FusedField:
 
         def sdf(x: Tensor) -> Tensor:
             out = torch.empty(len(x))
-            given = (x.contiguous().numpy(), *arrays, out.numpy())
+            given = (_array(x), *arrays, out.numpy())
             in_parts(len(x), lambda begin, end: kernels.distances(*given, begin, end), least=256)
             return out
 

@@ -21,6 +21,7 @@ from twofold.kernels.lanes import (
     sum_of_products,
 )
 from twofold.kernels.parallel import compiled, compiled_part
+from twofold.kernels.row_gradient import NOW
 
 
 @compiled_part
@@ -120,7 +121,7 @@ def pulled(slopes, u, s, axis, columns):  # noqa: ANN001, ANN201
 
 @compiled
 def scatter(x, by_features, grid, by_table, marks, first, end):  # noqa: ANN001, ANN201
-    """by_table[N C] += transpose of `lookup` for the levels first..end, which own their rows; marks[N] = 2 there.
+    """by_table[N C] += transpose of `lookup` for the levels first..end, which own their rows; marks[N] = `NOW` there.
 
     `marks` may be empty.
     """
@@ -137,7 +138,7 @@ def scatter(x, by_features, grid, by_table, marks, first, end):  # noqa: ANN001,
                     near = base + a * far_i + b * far_j
                     r0, r1 = rows[near], rows[near + 1]
                     if marking:
-                        marks[r0] = marks[r1] = 2
+                        marks[r0] = marks[r1] = NOW
                     for c in range(0, width, QUAD):
                         value = load4(by_features, s, level * width + c)
                         store4(by_table, r0, c, scaled_plus(flat * (one - w), value, load4(by_table, r0, c)))
@@ -148,7 +149,7 @@ def scatter(x, by_features, grid, by_table, marks, first, end):  # noqa: ANN001,
 def scatter_slopes(x, by_slopes, direction, grid, by_table, marks, first, end):  # noqa: ANN001, ANN201
     """by_table[N C] += derivative of <direction, J^T by_slopes> by the table, J the derivative of `lookup` by x.
 
-    marks[N] = 2 where something is added; `marks` may be empty.
+    marks[N] = `NOW` where something is added; `marks` may be empty.
     """
     _, rows, place, shape = grid
     one, width, marking = np.float32(1), by_table.shape[1], marks.shape[0] > 0
@@ -167,7 +168,7 @@ def scatter_slopes(x, by_slopes, direction, grid, by_table, marks, first, end): 
                         slope = da * wb * wd + wa * db * wd + wa * wb * dd
                         row = rows[base + a * far_i + b * far_j + d]
                         if marking:
-                            marks[row] = 2
+                            marks[row] = NOW
                         for c in range(0, width, QUAD):
                             value = load4(by_slopes, s, level * width + c)
                             store4(by_table, row, c, scaled_plus(slope, value, load4(by_table, row, c)))

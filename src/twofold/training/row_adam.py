@@ -55,7 +55,7 @@ class RowAdam(torch.optim.Adam):
         if gradient is None:
             return
         first, second, _ = self._advanced(table)
-        count = self.state[table].setdefault("visits", torch.zeros(len(table)))
+        count = self.state[table].setdefault("visits", torch.zeros(len(table), device=table.device))
         seen = gradient.flatten(1).abs().amax(1).nonzero()[:, 0]
         g, table.grad = gradient[seen], None
         count[seen] += 1

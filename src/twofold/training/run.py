@@ -244,7 +244,7 @@ def load(folder: Path, device: torch.device | str = "cpu") -> tuple[Avatar, int]
             f"{folder / CHECKPOINT} holds {broken} with numbers that are not finite, so its avatar cannot be used; "
             f"{lower_rates(recipe)}."
         )
-    colors = read_camera_colors(folder)
+    colors = _camera_colors(folder, tensors)
     avatar.camera_response = None if colors is None else LearnedResponse(colors.to(device))
     return avatar.to(device).eval(), step
 
@@ -255,7 +255,11 @@ def read_camera_colors(folder: Path) -> CameraColors | None:
     Raises:
         TwofoldError: there is no checkpoint, or it is damaged.
     """
-    tensors, _, _ = read_checkpoint(folder)
+    return _camera_colors(folder, read_checkpoint(folder)[0])
+
+
+def _camera_colors(folder: Path, tensors: dict[str, Tensor]) -> CameraColors | None:
+    """`read_camera_colors` of a checkpoint that has been read."""
     if "camera_colors.offset" not in tensors:
         return None
     recipe, cameras = read_recipe(folder), json.loads(_metadata(folder / CHECKPOINT).get("cameras", "[]"))
