@@ -14,6 +14,7 @@ from typing import Any
 
 from benchmarks.common import store
 from benchmarks.study_section import FULL
+from twofold.reproduce.cells import read_cell
 from twofold.reproduce.pose_distance import PROTOCOL, binned
 
 METRICS = {
@@ -37,9 +38,8 @@ def collect(table: dict[str, Any], cells: Path) -> dict[str, Any]:
         if cell["state"] != "done":
             continue
         found = json.loads((cells / cell["key"] / "results.json").read_text("utf-8"))
-        steps[cell["row"]] = json.loads((cells / cell["key"] / "cell.json").read_text("utf-8"))["recipe"]["training"][
-            "steps"
-        ]
+        recipe = read_cell(cells / cell["key"]).recipe
+        steps[cell["row"]] = recipe.method.total_steps(recipe.training)
         images.setdefault(cell["row"], []).extend(i for i in found["images"] if i["split"] == "novel_pose")
         for section, names in METRICS.items():
             for name in names:

@@ -144,3 +144,19 @@ def test_command_interrupted_twice_ends_with_the_same_table(person_folder, tmp_p
     assert run(tmp_path / "parts", False)[0] == 0
     name = f"tables/ablation-{person_folder.name}-quick.json"
     assert (tmp_path / "parts" / name).read_text() == (tmp_path / "whole" / name).read_text()
+
+
+def test_steps_are_those_of_every_cell_and_stand_with_the_table(tmp_path, capsys, quick_work):
+    words = ["reproduce", "main", "--out", str(tmp_path), "--methods", "npc", "factorized", "--steps", "40", *DEBUG]
+    main(words)
+    said = " ".join(capsys.readouterr().err.split())
+    # The figures are of the same cells only with the same options.
+    assert "Next: twofold reproduce figures --data studio" in said
+    assert "--steps 40" in said
+    found = [cells.read_cell(folder).recipe for folder in (tmp_path / "cells").iterdir()]
+    assert sorted(recipe.method.total_steps(recipe.training) for recipe in found) == [40, 40]
+    assert json.loads((tmp_path / "tables" / "main-studio-quick.json").read_text())["about"]["steps"] == 40
+
+
+def test_steps_below_one_are_refused_in_one_sentence(tmp_path, capsys):
+    assert "--steps should be at least 1; it is 0" in refused(capsys, "reproduce", "main", "--steps", 0)

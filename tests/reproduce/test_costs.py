@@ -48,3 +48,8 @@ def test_every_ablation_that_a_cpu_can_train_has_a_known_rate(table, recipe):
 
 def test_rates_belong_to_recipes_there_are():
     assert set(RATES) - {"demo"} <= set(RECIPES)
+
+
+def test_both_stages_of_a_cell_count():
+    (place,) = planned("main", [StudioSource(101)], "quick", 1, ["npc"])
+    assert expected_seconds(place.cell, {"npc_fast": 1.0}) == pytest.approx(2000 / TRAINING_SHARE)

@@ -99,3 +99,19 @@ def test_rows_can_be_chosen_and_unknown_ones_are_refused_with_those_there_are():
     assert {place.row.key for place in plan("main", methods=["npc", "factorized"])} == {"npc", "factorized"}
     with pytest.raises(TwofoldError, match=r"no row 'danbo'; it has humannerf, .*factorized"):
         plan("main", methods=["danbo"])
+
+
+def test_steps_scale_the_whole_schedule_of_every_row_and_settings_still_hold():
+    rows = {place.row.key: place.cell.recipe for place in plan("main", steps=300, settings=["training.pixels.rays=99"])}
+    assert {recipe.method.total_steps(recipe.training) for recipe in rows.values()} == {300}
+    own, short = RECIPES["npc_fast"]().method.first_steps, rows["npc"].method.first_steps
+    assert (own, short) == (500, 75)
+    assert {recipe.training.pixels.rays for recipe in rows.values()} == {99}
+
+
+def test_cells_of_other_lengths_are_other_cells():
+    def keys(**options):
+        return {place.cell.key for place in plan("ablation", seeds=1, **options)}
+
+    assert not keys() & keys(steps=300)
+    assert keys(steps=900) == keys()

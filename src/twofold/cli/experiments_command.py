@@ -29,6 +29,7 @@ def reproduce(
     subjects: int | None = None,
     seeds: int = 1,
     size: int | None = None,
+    steps: int | None = None,
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     max_images: int | Literal["all"] = 30,
     max_meshes: int = 2,
@@ -53,7 +54,8 @@ def reproduce(
         subjects: How many; by default one synthetic subject, or all captures.
         seeds: Trainings of each row and subject, from seed 0.
         size: Rows and columns of synthetic subjects' images; by default 192.
-        set: Settings of all recipes, such as training.steps=300; one or several, once or several times.
+        steps: Steps of every training, with its whole schedule scaled to them; by default each recipe's own.
+        set: Settings of all recipes, such as training.pixels.rays=500; one or several, once or several times.
         max_images: Images measured of each split, evenly spread; all for all.
         max_meshes: Ground-truth meshes measured, evenly spread.
         weights: Folder with the published weights of LPIPS and Inception; by default the usual caches.
@@ -77,7 +79,7 @@ def reproduce(
 
     images = None if max_images == "all" else max_images
     within(
-        subjects=(subjects, 1, 10_000), seeds=(seeds, 1, 1000), size=(size, 32, 4096), workers=(workers, 1, 1024),
+        subjects=(subjects, 1, 10_000), seeds=(seeds, 1, 1000), size=(size, 32, 4096), steps=(steps, 1, None), workers=(workers, 1, 1024),
         max_images=(images, 1, None), max_meshes=(max_meshes, 0, None),
     )  # fmt: skip
     if weights is not None and not weights.is_dir():
@@ -90,10 +92,10 @@ def reproduce(
         for name in EXPERIMENTS:
             # Settings may be for one kind of recipe only; its tables are those that could have been made.
             with contextlib.suppress(TwofoldError):
-                plans[name] = planned(name, sources, recipe, seeds, (), set, measures, data == "studio")
+                plans[name] = planned(name, sources, recipe, seeds, (), set, measures, data == "studio", steps)
         _figures(plans, out, stem)
         return
-    plan = planned(table, sources, recipe, seeds, methods, set, measures, data == "studio")
+    plan = planned(table, sources, recipe, seeds, methods, set, measures, data == "studio", steps)
     cells = part_of(distinct([place.cell for place in plan]), shard)
     rates = known_rates(out)
     if dry_run:
@@ -101,13 +103,16 @@ def reproduce(
         return
     about: dict[str, object] = {
         "data": data, "recipe": recipe, "subjects": [source.name for source in sources], "seeds": seeds,
-        "settings": list(set), "measures": asdict(measures),
+        "settings": list(set), "measures": asdict(measures), **({} if steps is None else {"steps": steps}),
     }  # fmt: skip
     executor = _executor(cluster, cluster_hours, cluster_gpus, workers, out)
     failed = _do(plan, cells, out, executor, rates, table)
     file = _write(table, plan, out, about, stem)
     missing = sum(place.cell.results(out) is None for place in plan)
     words = ["twofold", "reproduce", table, "--data", data, "--recipe", recipe, "--out", str(out)]
+    chosen = {"--subjects": subjects, "--seeds": seeds if seeds > 1 else None, "--size": size, "--steps": steps}
+    words += [word for option, value in chosen.items() if value is not None for word in (option, str(value))]
+    words += [word for setting in set for word in ("--set", setting)]
     if failed:
         raise TwofoldError(
             f"{len(failed)} of {len(cells)} cells failed, the first with: {next(iter(failed.values()))} The others "

@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
+from typing import cast
 
 from twofold.inputs import read_json
+from twofold.methods.base import MethodConfig
 from twofold.reproduce.cells import CELLS, RESULTS, TRAINING_SHARE, Cell
 
 RATES: dict[str, float] = {
@@ -38,7 +40,8 @@ def expected_seconds(cell: Cell, rates: dict[str, float]) -> float | None:
     """
     name = cell.recipe.name
     rate = rates.get(name) or rates.get(name.partition(" ")[0]) or RATES.get(name) or RATES.get(name.partition(" ")[0])
-    return None if rate is None else rate * cell.recipe.training.steps / TRAINING_SHARE
+    steps = cast(MethodConfig, cell.recipe.method).total_steps(cell.recipe.training)
+    return None if rate is None else rate * steps / TRAINING_SHARE
 
 
 def left(cell: Cell, out: Path, rates: dict[str, float]) -> float | None:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from twofold.errors import TwofoldError
 from twofold.methods.factorized_recipes import ABLATIONS, BEYOND, ablation, demo_recipe, has_grids
-from twofold.methods.table import RECIPES, with_settings
+from twofold.methods.table import RECIPES, with_settings, with_steps
 from twofold.recipe import Recipe
 from twofold.reproduce.cells import Cell
 from twofold.reproduce.measuring import Measures
@@ -244,7 +244,7 @@ EXPERIMENTS: dict[str, Experiment] = {
 
 def planned(
     experiment: str, sources: Sequence[Source], recipe: RecipeName, seeds: int, methods: Sequence[str] = (),
-    settings: Sequence[str] = (), measures: Measures | None = None, synthetic: bool = True,
+    settings: Sequence[str] = (), measures: Measures | None = None, synthetic: bool = True, steps: int | None = None,
 ) -> list[PlannedCell]:  # fmt: skip
     """All cells of a table, subject by subject and seed by seed, so that early cells already compare all rows.
 
@@ -257,6 +257,7 @@ def planned(
         settings: changes of every recipe, such as "training.steps=300".
         measures: what is measured.
         synthetic: whether the subjects are synthetic.
+        steps: of every training, all stages together, with its whole schedule scaled; None for each recipe's own.
 
     Raises:
         TwofoldError: an unknown row or setting.
@@ -267,7 +268,12 @@ def planned(
     if unknown:
         raise TwofoldError(f"--methods: the table {experiment} has no row {unknown[0]!r}; it has {', '.join(keys)}.")
     chosen = [row for row in rows if row.key in methods or not methods]
-    recipes = {row.key: with_settings(row.recipe(), settings) for row in chosen}
+
+    def recipe_of(row: TableRow) -> Recipe:
+        own = row.recipe()
+        return with_settings(own if steps is None else with_steps(own, steps), settings)
+
+    recipes = {row.key: recipe_of(row) for row in chosen}
     return [
         PlannedCell(row, source.name, seed, Cell(source, replace(recipes[row.key], seed=seed), measures or Measures()))
         for source in sources
