@@ -53,6 +53,12 @@ def test_positions_are_the_farthest_points_of_each_part(generator):
         assert torch.equal(positions[:, k], chosen)
     with pytest.raises(TwofoldError, match=f"needs {fewest + 1} surface points for each body part, the .* has"):
         choose_positions(coordinates, half_sizes, fewest + 1)
+    # Of parts that no image shows the other points are taken, and of these parts alone.
+    other = choose_positions(coordinates.flip(0), half_sizes, fewest)
+    mixed = choose_positions(coordinates, half_sizes, fewest, {3, 7}, coordinates.flip(0))
+    assert not torch.equal(other, positions)
+    for k in range(19):
+        assert torch.equal(mixed[:, k], (other if k in (3, 7) else positions)[:, k])
 
 
 def test_neighbours_are_the_nearest_and_begin_with_the_point_itself(generator):

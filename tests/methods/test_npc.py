@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+import trimesh
 from small_recipes import CASES
 
+from twofold.body.skeleton import pose_body, shape_body
 from twofold.errors import TwofoldError
 from twofold.field.bone_boxes import RIGID_PARTS, box_coordinates, inside_boxes
 from twofold.geometry.cameras import pixel_grid, pixel_rays
@@ -92,6 +94,22 @@ def test_points_lie_on_the_first_stages_surface_in_their_boxes(subject, person):
     # All is dense in the boxes, so the surface is where no box is left: no point is deep in any.
     assert (inside_boxes(coordinates).any(-1)).all()
     assert deepest.amax(1).max() < 2 * RECIPE.method.point_voxel
+
+
+def test_points_of_unseen_parts_lie_on_the_body(subject):
+    first = RECIPE.method.build(subject, 0)
+    with torch.no_grad():
+        first.local.radiance.density.layers[-1].bias += 100
+    hidden = RIGID_PARTS.index(9)
+    positions, mixed = first.find_positions(), first.find_positions({hidden})
+    others = [k for k in range(len(RIGID_PARTS)) if k != hidden]
+    assert torch.equal(mixed[:, others], positions[:, others])
+    first.begin_points(mixed, torch.Generator(), 1)
+    rest = torch.zeros(24, 3)
+    surface = pose_body(shape_body(subject.body, subject.betas), rest, rest[0])
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
+    points = first.points.cloud.rest_points()[:, hidden].detach().numpy()
+    assert trimesh.proximity.closest_point_naive(mesh, points)[1].max() < 1e-4
 
 
 def test_a_first_stage_without_a_surface_is_told(subject, person):

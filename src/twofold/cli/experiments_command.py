@@ -79,8 +79,8 @@ def reproduce(
 
     images = None if max_images == "all" else max_images
     within(
-        subjects=(subjects, 1, 10_000), seeds=(seeds, 1, 1000), size=(size, 32, 4096), steps=(steps, 1, None), workers=(workers, 1, 1024),
-        max_images=(images, 1, None), max_meshes=(max_meshes, 0, None),
+        subjects=(subjects, 1, 10_000), seeds=(seeds, 1, 1000), size=(size, 32, 4096), steps=(steps, 1, None),
+        workers=(workers, 1, 1024), max_images=(images, 1, None), max_meshes=(max_meshes, 0, None),
     )  # fmt: skip
     if weights is not None and not weights.is_dir():
         raise TwofoldError(f"{weights} is not a folder; name the one that holds the weights, or leave --weights out.")

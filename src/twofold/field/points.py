@@ -5,6 +5,7 @@ slot * 19 + part.
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import torch
@@ -52,8 +53,9 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "co
 
 
 def choose_positions(
-    coordinates: Float[Tensor, "n 19 3"], half_sizes: Float[Tensor, "19 3"], count: int = 200
-) -> Float[Tensor, "count 19 3"]:
+    coordinates: Float[Tensor, "n 19 3"], half_sizes: Float[Tensor, "19 3"], count: int = 200,
+    unseen: Collection[int] = (), instead: Float[Tensor, "b 19 3"] | None = None,
+) -> Float[Tensor, "count 19 3"]:  # fmt: skip
     r"""Box coordinates of `count` surface points for each part, as far from each other as can be.
 
     \[ \{ u_{jk} \} \subset \{ u_j : x \text{ in box } j \} \text{ by farthest points of } S_j u_j \]
@@ -65,14 +67,19 @@ def choose_positions(
         coordinates: of points on the surface that DANBO found (rest pose), in the boxes of the rigid parts.
         half_sizes: of these boxes, metres.
         count: points of each part.
+        unseen: parts that no image shows, where DANBO's surface is of no use.
+        instead: points that stand for the surface there.
 
     Raises:
         TwofoldError: a part has fewer points.
     """
     part = assign_to_boxes(coordinates, half_sizes)
+    other = part[:0] if instead is None else assign_to_boxes(instead, half_sizes)
     columns = []
     for index, joint in enumerate(RIGID_PARTS):
         own = coordinates[part == index, index]
+        if instead is not None and index in unseen:
+            own = instead[other == index, index]
         if len(own) < count:
             raise TwofoldError(
                 f"NPC needs {count} surface points for each body part, the {JOINT_NAMES[joint]} has {len(own)}; train "

@@ -313,8 +313,8 @@ class Avatar(nn.Module, ABC, Generic[Own]):
         """The stages of a training, one after the other; most methods have one."""
         return (Stage("train", training),)
 
-    def check_capture(self, capture: Capture) -> None:
-        """Called with the capture of a new training before anything is written.
+    def check_capture(self, capture: Capture) -> str | None:
+        """Called with the capture of a new training before anything is written; may return a note for the user.
 
         Raises:
             TwofoldError: the capture lacks what the method needs.

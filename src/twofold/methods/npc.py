@@ -1,6 +1,6 @@
 """NPC (Neural Point Characters): a cloud of points on the person, found by DANBO, and a surface read from it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -23,7 +23,7 @@ from twofold.methods.boxed_config import (
     short_training,
 )
 from twofold.methods.local_radiance import POSE_OCTAVES, LocalRadiance, inside_rigid
-from twofold.methods.point_needs import require_points
+from twofold.methods.point_needs import body_surface, require_points, unseen_parts
 from twofold.methods.point_networks import BETA, PointNetworks, PointWeights, ReadyPoints, surface_positions
 from twofold.methods.subject import Subject
 from twofold.recipe import Recipe, TrainingConfig, scaled_count
@@ -127,14 +127,14 @@ class NpcAvatar(BoxedAvatar[Shared]):
         first = replace(training, steps=config.first_steps, decay=config.first_decay, pixels=pixels)
         return Stage("boxes", first), Stage("points", training)
 
-    def check_capture(self, capture: Capture) -> None:
-        """See `Avatar.check_capture`: every body part has to be shown, and be large enough for its points.
+    def check_capture(self, capture: Capture) -> str | None:
+        """See `Avatar.check_capture`: nearly every body part has to be shown, and be large enough for its points.
 
         Raises:
             TwofoldError: see `require_points`.
         """
         sizes = self.boxes().detach().cpu()[list(RIGID_PARTS)]
-        require_points(capture, sizes, self.config.points, self.config.point_voxel)
+        return require_points(capture, sizes, self.config.points, self.config.point_voxel)
 
     def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
         """See `Avatar.prepare_training`: the second stage begins with points on the surface of the first one's field.
@@ -144,14 +144,18 @@ class NpcAvatar(BoxedAvatar[Shared]):
         """
         if stage == 1:
             cameras = [(f.frame_index, f.camera) for f in capture.train]
-            self.begin_points(self.find_positions(), generator, len(cameras))
+            sizes = self.boxes().detach().cpu()[list(RIGID_PARTS)]
+            self.begin_points(self.find_positions(unseen_parts(capture, sizes)), generator, len(cameras))
             rows = torch.stack([torch.cat([c.world_to_camera, _intrinsics(c.intrinsics)]) for _, c in cameras])
             sizes = torch.tensor([[time, c.width, c.height] for time, c in cameras])
             self.cameras, self.camera_sizes = rows.to(self.device), sizes.to(self.device)
 
     @torch.no_grad()
-    def find_positions(self) -> Float[Tensor, "m 19 3"]:
+    def find_positions(self, unseen: Collection[int] = ()) -> Float[Tensor, "m 19 3"]:
         """Points on the first stage's surface in the T-pose; the field is computed inside its boxes only.
+
+        Args:
+            unseen: parts that no image shows, whose points lie on the body's surface instead.
 
         Raises:
             TwofoldError: there is no surface, or too little of it in a part.
@@ -168,7 +172,9 @@ class NpcAvatar(BoxedAvatar[Shared]):
             for x in axes[0]
         ]
         volume = torch.stack(slabs).cpu().numpy()
-        return surface_positions(volume, low, voxel, self.rest_joints, posed.own.half_sizes, config.points)
+        body, _ = body_surface(self.subject.body, self.subject.betas)
+        sizes = posed.own.half_sizes
+        return surface_positions(volume, low, voxel, self.rest_joints, sizes, config.points, unseen, body)
 
     def begin_points(self, positions: Float[Tensor, "m 19 3"], generator: torch.Generator | None, cameras: int) -> None:
         """Puts the networks of the second stage in the place of the first one's.

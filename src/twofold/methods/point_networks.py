@@ -1,5 +1,6 @@
 """NPC's second stage: points on the surface that its first stage found, and the networks that read them."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -161,6 +162,8 @@ def surface_positions(
     joints: Float[Tensor, "24 3"],
     half_sizes: Float[Tensor, "24 3"],
     count: int,
+    unseen: Collection[int] = (),
+    body: Float[Tensor, "b 3"] | None = None,
 ) -> Float[Tensor, "m 19 3"]:
     """Box coordinates of points where a level of the rest pose is zero, `count` (m) of each part; see `PointCloud`.
 
@@ -171,6 +174,8 @@ def surface_positions(
         joints: of the rest pose, metres.
         half_sizes: of all boxes, metres.
         count: points of each part.
+        unseen: parts that no image shows.
+        body: points on the body's surface, which are taken there, metres.
 
     Raises:
         TwofoldError: there is no surface, or too little of it in a part.
@@ -184,4 +189,5 @@ def surface_positions(
     still = torch.eye(4, dtype=low.dtype, device=low.device).repeat(24, 1, 1)
     to_frame = bone_frames(joints).world_to_frame(still)[list(RIGID_PARTS)]
     rigid = half_sizes[list(RIGID_PARTS)]
-    return choose_positions(box_coordinates(vertices, to_frame, rigid), rigid, count)
+    instead = None if body is None else box_coordinates(body.to(low), to_frame, rigid)
+    return choose_positions(box_coordinates(vertices, to_frame, rigid), rigid, count, unseen, instead)

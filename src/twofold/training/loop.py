@@ -195,10 +195,9 @@ def train(
         if not resume and team.leads:
             require_free(folder)
         avatar = recipe.method.build(subject, recipe.seed).to(device)
-        if not resume:
-            avatar.check_capture(capture)
+        found = None if resume else avatar.check_capture(capture)
         first = before_first(avatar) if before_first else None
-        notes = [first] if first else []
+        notes = [note for note in (first, found) if note]
         if wants_compiling(config, device):
             notes.append(COMPILED if at_the_end.enter_context(avatar.compiled()) else NOTHING_COMPILED)
         if say and team.leads:
