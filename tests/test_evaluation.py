@@ -1,5 +1,7 @@
 """What is measured, and what the file says about it."""
 
+import json
+import shutil
 import weakref
 from dataclasses import replace
 from unittest.mock import Mock
@@ -12,9 +14,11 @@ from PIL import Image
 
 from twofold import evaluation as evaluate
 from twofold.capture.types import Capture, Frame
+from twofold.cli.main import main
 from twofold.deform.pose_refinement import PoseRefinement
 from twofold.geometry.cameras import Camera
 from twofold.methods.base import Avatar
+from twofold.methods.factorized import FactorizedAvatar
 from twofold.metrics.protocols import Networks
 from twofold.outputs.views import RenderedImage
 from twofold.training.clock import read_spent
@@ -119,6 +123,18 @@ def test_progress_goes_to_the_end_and_no_further(trained, tmp_path):
     assert all(before < 1 for before in shares[:-1])
     sections = {name for name in metrics if name not in ("pose_refinement", "cost", "coverage")}
     assert {what for _, what in told} == sections | {"pose refinement"}
+
+
+def test_an_avatar_without_a_surface_is_measured_all_the_same(trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(FactorizedAvatar, "level", lambda self, points, *_: torch.ones(len(points)))
+    run = shutil.copytree(trained.folder, tmp_path / "run")
+    main(["evaluate", str(run), "--max-images", "1", "--capture", str(trained.capture.folder)])
+    shown = " ".join(capsys.readouterr().err.split())
+    assert "novel_view: psnr" in shown
+    assert "geometry: not measured: The avatar has no surface within" in shown
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["novel_view"]["psnr_box"] > 0
+    assert set(metrics["geometry"]) == {"protocol"}
 
 
 def test_by_default_a_long_split_is_sampled_evenly_and_the_protocol_says_so(capture, monkeypatch):

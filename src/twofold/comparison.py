@@ -146,11 +146,7 @@ def measured(
         if shown:
             metrics[split] = measure_split(avatar, capture, split, most, True, rendered)
             images[split] = [cut[row] for row in range(len(shown))]
-    try:
-        geometry = measure_geometry(avatar, capture, meshes, progress=progress) if meshes else {}
-    except TwofoldError:
-        # A field without a surface has no distance to the true one; its images are compared all the same.
-        geometry = {}
+    geometry = measure_geometry(avatar, capture, meshes, progress=progress) if meshes else {}
     if geometry:
         metrics["geometry"] = geometry
     metrics["cost"] = measure_cost(avatar, capture, read_spent(run / CHECKPOINT))

@@ -11,6 +11,10 @@ class TwofoldError(Exception):
     """
 
 
+class NoSurfaceError(TwofoldError):
+    """A field has no surface near the body: what needs one is left out of the metrics, and all else is measured."""
+
+
 def install_command(extra: str) -> str:
     """The command that installs an extra, such as "prepare", for the way in which this program is installed.
 

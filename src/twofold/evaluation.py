@@ -12,6 +12,7 @@ import torch
 from twofold.capture.coverage import coverage_of
 from twofold.capture.types import Capture, Frame, spread
 from twofold.capture.validate import read_mesh
+from twofold.errors import NoSurfaceError
 from twofold.files import write_json
 from twofold.methods.base import Avatar, PosedAvatar
 from twofold.metrics import image as image_metrics
@@ -146,11 +147,17 @@ def measure_geometry(
     avatar: Avatar, capture: Capture, most: int | None = None, voxel: float = 0.008,
     progress: Callable[[], None] | None = None,
 ) -> dict[str, object]:  # fmt: skip
-    """Means of the surface metrics over the frames whose true mesh is known; empty where none is."""
+    """Means of the surface metrics over the frames whose true mesh is known; empty where none is.
+
+    Of an avatar without a surface there are no numbers, and "protocol" says so.
+    """
     rows = []
     for time, frame in _with_mesh(capture, most).items():
         posed = avatar.pose(frame.pose, frame.translation, None)
-        vertices, faces = posed_surface(avatar, posed, voxel)
+        try:
+            vertices, faces = posed_surface(avatar, posed, voxel)
+        except NoSurfaceError as error:
+            return {"protocol": f"not measured: {error}"}
         rows.append(shape_metrics.compare_surfaces(vertices.cpu(), faces.cpu(), *read_mesh(capture.meshes[time])))
         if progress:
             progress()

@@ -244,7 +244,7 @@ def evaluate(
             line = f"{section}: " + ", ".join(
                 f"{k} {v:,}" if isinstance(v, int) else f"{k} {v:.4g}" for k, v in numbers.items()
             )
-            console().print(line, soft_wrap=True)
+            console().print(line if numbers else f"{section}: {values.get('protocol')}", soft_wrap=True)
     sampled = {split: len(read.splits.get(split, ())) for split in ("novel_view", "novel_pose")}
     if images is not None and max(sampled.values()) > images:
         counts = ", ".join(f"{min(images, count)} of {count} of {split}" for split, count in sampled.items() if count)

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from twofold.errors import TwofoldError
+from twofold.errors import NoSurfaceError, TwofoldError
 from twofold.geometry.surfaces import face_areas
 from twofold.kernels.kdtree import search_tree
 
@@ -67,7 +67,7 @@ def extract_surface(
         wanted[tuple(slice(c, n + c) for c, n in zip(corner, fine.shape, strict=True))] |= fine
     ask((wanted & volume.isnan()).nonzero())
     if not (volume[wanted] < 0).any() or not (volume[wanted] > 0).any():
-        raise TwofoldError(
+        raise NoSurfaceError(
             f"The avatar has no surface within {100 * radius:g} cm of its body; train it longer, or check its losses."
         )
     vertices, faces = _marching_cubes(volume.numpy(), fine.numpy(), voxel)
