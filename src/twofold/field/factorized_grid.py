@@ -58,6 +58,8 @@ class GridFieldConfig:
     """Features exist this far from the canonical body, metres; at least the shell's radius."""
     finest_radius: float | None = None
     """The same of the finest spacing of the pose-dependent branch alone, metres; none: like all others."""
+    follow_images: bool = False
+    """Whether a training adds finer spacings to the pose-dependent branch where its images show more than these."""
     gate_width: float | None = 0.05
     """Distance from the low branch's surface at which the high branch has half its effect, metres; none: plain sums."""
     branches: Literal["both", "low", "high", "high_rendered"] = "both"

@@ -187,6 +187,10 @@ class MethodConfig(ABC):
         How often something is repeated to save time, or to keep up with the parameters, is no schedule and stays.
         """
 
+    def fitted(self, capture: Capture) -> tuple["MethodConfig", str | None]:
+        """The configuration with what it leaves to a capture settled, and what to tell the user about that."""
+        return self, None
+
     def completing(self, on: bool) -> "MethodConfig":
         """The configuration with unobserved regions completed in training, or left as they come.
 
@@ -195,10 +199,8 @@ class MethodConfig(ABC):
         """
         if not on:
             return self
-        raise TwofoldError(
-            f"{type(self).__name__} does not complete unobserved regions; leave --complete on out, or choose another "
-            "--recipe."
-        )
+        own = type(self).__name__
+        raise TwofoldError(f"{own} does not complete unobserved regions; leave --complete on out, or change --recipe.")
 
 
 class Avatar(nn.Module, ABC, Generic[Own]):

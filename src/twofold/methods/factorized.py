@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from twofold.capture.types import Capture
 from twofold.config import require
 from twofold.field.factorized import FactorizedField, FactorizedFieldConfig
 from twofold.field.factorized_grid import GridField, GridFieldConfig
@@ -18,6 +19,7 @@ from twofold.kernels.row_gradient import RowGradient
 from twofold.kernels.runtime import compiled_methods
 from twofold.methods.base import Batch, Mode, ParameterGroup, Rendering
 from twofold.methods.factorized_config import RateConfig
+from twofold.methods.pixel_levels import following
 from twofold.methods.skinned import Posed, SkinnedAvatar
 from twofold.methods.skinned_config import SkinnedConfig
 from twofold.methods.subject import Subject
@@ -39,6 +41,13 @@ class FactorizedConfig(SkinnedConfig):
         if isinstance(self.field, GridFieldConfig) and isinstance(self.sampler, ShellSampler):
             within = self.sampler.radius <= self.field.radius
             require(within, f"sampler.radius should be at most field.radius={self.field.radius}, where features end")
+
+    def fitted(self, capture: Capture) -> tuple["FactorizedConfig", str | None]:
+        """See `MethodConfig.fitted`: feature grids become as fine as the images."""
+        if not isinstance(self.field, GridFieldConfig):
+            return self, None
+        field, note = following(self.field, capture)
+        return dataclasses.replace(self, field=field), note
 
     def build(self, subject: Subject, seed: int = 0) -> "FactorizedAvatar":
         """An untrained avatar of a subject."""

@@ -8,7 +8,9 @@ ABSENT: dict[str, dict[str, object]] = {
     "method": {"late_neighbours": None, "late_from": 100, "normals_by": "posed", "background": "capture"},
     "method.sampler:ErrorBoundedSampler": {"units": "metres", "box": "posed"},
     "method.sampler:ShellSampler": {"leap": 0.0, "finest": 0.0},
-    "method.field:GridFieldConfig": {"detail_voxels": [], "detail_parts": list(DETAILED), "finest_radius": None},
+    "method.field:GridFieldConfig": {
+        "detail_voxels": [], "detail_parts": list(DETAILED), "finest_radius": None, "follow_images": False,
+    },
     "method.pose": {
         "zero_epochs": 0, "epochs": "moments", "canonical_shape": "refined", "test_shape": "refined",
         "observed_only": False, "averages": "steps", "decay_power": 1.0,

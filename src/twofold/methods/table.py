@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
+from twofold.capture.types import Capture
 from twofold.config import KIND, from_dict, to_dict, with_overrides
 from twofold.errors import TwofoldError
 from twofold.inputs import shown
@@ -128,6 +129,12 @@ def chosen_recipe(
     if completion is not None:
         recipe = with_completion(recipe, completion)
     return with_settings(recipe, [f"seed={seed}", *settings])
+
+
+def fitted(recipe: Recipe, capture: Capture) -> tuple[Recipe, str | None]:
+    """The recipe with what its method leaves to a capture settled, and what to tell the user about that."""
+    method, note = cast(MethodConfig, recipe.method).fitted(capture)
+    return replace(recipe, method=method), note
 
 
 def with_completion(recipe: Recipe, on: bool) -> Recipe:

@@ -20,6 +20,7 @@ from twofold.files import plain_errors
 from twofold.kernels.runtime import flush_denormals
 from twofold.methods.base import Avatar, Mode, Stage
 from twofold.methods.subject import Subject
+from twofold.methods.table import fitted
 from twofold.recipe import Recipe, TrainingConfig
 from twofold.sampling.joint_box import RELEASED_MARGIN, RELEASED_SLACK
 from twofold.training.camera_colors import CameraColors, LearnedResponse, load_camera_colors
@@ -182,6 +183,7 @@ def train(
         KeyboardInterrupt: passed on after the state has been stored.
     """
     flush_denormals()
+    recipe, settled = fitted(recipe, capture)
     config = recipe.training
     with (
         plain_errors(folder), joined(device) as team, asked_to_stop() as stopped, contextlib.ExitStack() as at_the_end
@@ -197,7 +199,7 @@ def train(
         avatar = recipe.method.build(subject, recipe.seed).to(device)
         found = None if resume else avatar.check_capture(capture)
         first = before_first(avatar) if before_first else None
-        notes = [note for note in (first, found) if note]
+        notes = [note for note in (first, found, settled) if note]
         if wants_compiling(config, device):
             notes.append(COMPILED if at_the_end.enter_context(avatar.compiled()) else NOTHING_COMPILED)
         if say and team.leads:
