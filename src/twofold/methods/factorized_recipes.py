@@ -113,7 +113,7 @@ def quick() -> Recipe:
     return Recipe(
         name="quick",
         method=FactorizedConfig(
-            field=GridFieldConfig(),
+            field=GridFieldConfig(follow_images=True),
             sampler=ShellSampler(radius=0.06, step=0.01, min_weight=2e-3, miswarp_slack=0.006, finest=0.0025),
             losses=LossConfig(
                 eikonal=0.05,
@@ -232,6 +232,8 @@ def ablation(name: str, start: Recipe) -> Recipe:
     if re.fullmatch(rf"\[[\d.]+{unit}(, ?[\d.]+{unit})?\]", name):
         frequencies = [float(number) for number in re.findall(r"[\d.]+", name)]
         changes = {"branches": "high"} if len(frequencies) == 1 else {}
+        if unit:
+            changes["follow_images"] = False
         for branch, frequency in zip(("high", "low"), frequencies[::-1], strict=False):
             if unit:
                 changes[f"{branch}_voxels"] = (0.02 * frequency, 0.01 * frequency)

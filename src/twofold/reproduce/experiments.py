@@ -81,8 +81,13 @@ class PlannedCell:
 
 
 def base_recipe(name: RecipeName, synthetic: bool) -> Recipe:
-    """The full model's recipe; synthetic subjects have the demo's settings for `quick`: 900 steps, exact poses."""
+    """The full model's recipe; synthetic subjects have the demo's settings for `quick`: 900 steps, exact poses.
+
+    Frequencies are as they are named, whatever the images show.
+    """
     recipe = demo_recipe(0) if name == "quick" and synthetic else RECIPES[name]()
+    if has_grids(recipe):
+        recipe = with_settings(recipe, ["method.field.follow_images=false"])
     return _silent(recipe)
 
 
