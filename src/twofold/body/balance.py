@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.skeleton import JOINT_NAMES
+from twofold.geometry.accelerations import accelerations
 
 GRAVITY = 9.81
 """Metres per second squared."""
@@ -33,7 +34,11 @@ def center_of_mass(joints: Float[Tensor, "t 24 3"]) -> Float[Tensor, "t 3"]:
 
 
 def center_of_pressure(
-    center: Float[Tensor, "t 3"], floor: Float[Tensor, ""], up: Float[Tensor, "3"], fps: float
+    center: Float[Tensor, "t 3"],
+    floor: Float[Tensor, ""],
+    up: Float[Tensor, "3"],
+    fps: float,
+    seconds: Float[Tensor, "t"] | None = None,
 ) -> Float[Tensor, "t 3"]:
     r"""Centre of pressure: where the floor has to hold a body that neither falls nor spins, metres.
 
@@ -47,13 +52,13 @@ def center_of_pressure(
         floor: its height along `up`, metres.
         up: unit vector.
         fps: frames per second.
+        seconds: when each was seen, where the times are not even.
     """
     if len(center) < 3:
         return center - (center @ up - floor)[:, None] * up
     reach = max(1, min(round(_ACCELERATION_SPAN * fps), (len(center) - 1) // 2))
     middle = center[reach:-reach]
-    change = (center[2 * reach :] - 2 * middle + center[: -2 * reach]) * (fps / reach) ** 2
-    force = change + GRAVITY * up
+    force = accelerations(center, fps, seconds, reach) + GRAVITY * up
     lift = (force @ up).clamp_min(0.3 * GRAVITY)
     inner = middle - ((middle @ up - floor) / lift)[:, None] * force
     return torch.cat([inner[:1].expand(reach, -1), inner, inner[-1:].expand(reach, -1)])

@@ -50,6 +50,7 @@ from twofold.prepare.video.clips import (
     Clip,
     PrepareConfig,
     advice,
+    are_uneven,
     focal_in_words,
     longer,
     open_clips,
@@ -233,7 +234,10 @@ def _fit_all(
         tracks = [own[0] or repairs[0].track]
     # Landmarks of the user's own are off by something else.
     offsets = [None if one is not None else seen.offsets for one, seen in zip(own, watched, strict=True)]
-    evidence = [Evidence(*parts) for parts in zip(cameras, tracks, [s.masks for s in watched], offsets, strict=True)]
+    times = seconds if are_uneven(seconds) else None
+    evidence = [
+        Evidence(*parts, times) for parts in zip(cameras, tracks, [s.masks for s in watched], offsets, strict=True)
+    ]
     free = config.intrinsics is None and config.calibration is None
     if given[0].motion is not None:
         motion = motion_at(given[0].motion, watched[0].sources)

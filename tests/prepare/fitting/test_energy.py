@@ -212,6 +212,20 @@ def smoothness(body, motion, fps):
     return float(costs[0] - costs[1])
 
 
+def test_a_steady_walk_seen_at_uneven_times_is_no_unrest():
+    body = with_numbers(the_body())
+    still = with_numbers(replace(random_motion(the_body(), 6), betas=torch.zeros(1)))
+    seconds = torch.tensor([0.0, 0.1, 0.2, 0.25, 0.55, 0.6]).double()
+    level = still.guess[:1].expand(6, 3, 3), still.root[:1].expand(6, 3), still.pose[:1].expand(6, 23, 3)
+    path = torch.tensor([1.4, 0.0, 0.0]).double() * seconds[:, None]
+    walk = replace(still, guess=level[0], root=level[1], pose=level[2], translation=still.translation[:1] + path)
+    posed, weights = pose_motion(body, walk), PriorWeights(smoothness=5.0)
+    costs = [float(prior(body, posed, walk, 10.0, weights, None, times)) for times in (None, seconds)]
+    calm = float(prior(body, posed, walk, 10.0, PriorWeights(smoothness=0.0)))
+    assert costs[1] == pytest.approx(calm, abs=1e-6)
+    assert costs[0] > calm + 0.1
+
+
 def test_small_bodies_are_not_favoured():
     """A guess about motion must not be won by shrinking the person."""
     body = with_numbers(the_body())

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from twofold.body.skeleton import JOINT_NAMES, Body
+from twofold.geometry.accelerations import accelerations
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.geometry.surfaces import vertex_normals
 from twofold.kernels.kdtree import search_tree
@@ -131,8 +132,12 @@ def prior(
     fps: float,
     weights: PriorWeights,
     offsets: Float[Tensor, "33 3"] | None = None,
+    seconds: Float[Tensor, "t"] | None = None,
 ) -> Tensor:
-    """How unlike people's shapes, poses and motion this is; `offsets` are the estimator's usual ones."""
+    """How unlike people's shapes, poses and motion this is; `offsets` are the estimator's usual ones.
+
+    `seconds` tells when each frame was seen, where the times are not even.
+    """
     spread = motion.pose.new_tensor([STIFFNESS[name.split("_")[-1].rstrip("123")] for name in JOINT_NAMES[1:]])
     loss = 0.05 * (motion.pose / spread[:, None]).square().sum((1, 2)).mean()
     loss = loss + 2.0 * _limits(motion.pose).mean()
@@ -140,9 +145,9 @@ def prior(
     if len(motion) > 2:
         # Small bodies move less; without their height taken out, a guess about it would win by shrinking the person.
         height = posed.vertices[:, 1].amax() - posed.vertices[:, 1].amin()
-        change = (joints[2:] - 2 * joints[1:-1] + joints[:-2]) * (fps**2 / weights.joint_acceleration * 1.7 / height)
+        change = accelerations(joints, fps, seconds) * (1.7 / height / weights.joint_acceleration)
         turns = torch.cat([motion.root[:, None], motion.pose], 1)
-        turning = (turns[2:] - 2 * turns[1:-1] + turns[:-2]) * (fps**2 / weights.turn_acceleration)
+        turning = accelerations(turns, fps, seconds) / weights.turn_acceleration
         # The motion's own smoothness is one piece of evidence per second, each image one per frame.
         weight = weights.smoothness / fps
         loss = loss + weight * (_gentle(change) + _gentle(turning))

@@ -225,8 +225,8 @@ def _fit_window(
             terms = landmark_term(posed, points, motion, seen, config.landmark * wide)
             terms = terms + direction * direction_term(posed, points, motion, seen, config.direction)
             if support is not None:
-                terms = terms + physics_term(body, posed, points, motion, support, fps, config.physics)
-            return terms + prior(body, posed, motion, fps, config.prior, seen.offsets)
+                terms = terms + physics_term(body, posed, points, motion, support, fps, config.physics, seen.seconds)
+            return terms + prior(body, posed, motion, fps, config.prior, seen.offsets, seen.seconds)
 
         return loss
 

@@ -27,24 +27,27 @@ class Evidence:
         masks: of each frame, as arrays (0..255) or as image files, which keeps the memory of long clips small;
             None where there are none.
         offsets: how far the estimator usually marks points off a body's (`Estimator.offsets`), metres.
+        seconds: when each frame was seen, where the times are not even.
     """
 
     camera: Camera
     track: Track
     masks: Sequence[Mask] | None = None
     offsets: Float[np.ndarray, "33 3"] | None = None
+    seconds: Float[np.ndarray, "t"] | None = None
 
     def __getitem__(self, times: slice) -> "Evidence":
         parts = {name: value[times] for name, value in vars(self.track).items()}
         masks = None if self.masks is None else self.masks[times]
-        return Evidence(self.camera, Track(**parts), masks, self.offsets)
+        seconds = None if self.seconds is None else self.seconds[times]
+        return Evidence(self.camera, Track(**parts), masks, self.offsets, seconds)
 
 
 @dataclass(frozen=True)
 class Seen:
     """Evidence of all cameras as tensors, c cameras and t frames; landmarks in space are each camera's or common.
 
-    Offsets are the estimators' usual ones, mean over the cameras.
+    Offsets are the estimators' usual ones, mean over the cameras; `seconds` is None where the times are even.
     """
 
     world_to_camera: Float[Tensor, "c 4 4"]
@@ -55,6 +58,7 @@ class Seen:
     space_weight: Float[Tensor, "k t 33"]
     size: Float[Tensor, "c"]
     offsets: Float[Tensor, "33 3"]
+    seconds: Float[Tensor, "t"] | None = None
 
 
 def gather(
@@ -86,6 +90,7 @@ def gather(
         in_space.float(),
         torch.tensor(sizes),
         torch.from_numpy(np.mean(offsets, 0)).float(),
+        None if evidence[0].seconds is None else torch.from_numpy(evidence[0].seconds),
     )
 
 

@@ -116,6 +116,7 @@ def balance_term(
     up: Float[Tensor, "3"],
     fps: float,
     error: float,
+    seconds: Float[Tensor, "t"] | None = None,
 ) -> Tensor:
     r"""Bodies that would fall over: the centre of pressure off the feet's middle; `error` in metres is usual.
 
@@ -126,7 +127,7 @@ def balance_term(
     """
     stands = support.stands
     floor, _ = floor_of(sole @ up, stands)
-    point = center_of_pressure(center_of_mass(joints), floor, up, fps)
+    point = center_of_pressure(center_of_mass(joints), floor, up, fps, seconds)
     middle = sole.mean(2)
     first, second = middle.unbind(1)
     along, free = second - first, point - first
@@ -147,6 +148,7 @@ def physics_term(
     support: Support,
     fps: float,
     weights: PhysicsWeights,
+    seconds: Float[Tensor, "t"] | None = None,
 ) -> Tensor:
     r"""How unlike a body that stands on a level floor this is.
 
@@ -157,7 +159,8 @@ def physics_term(
     size, up = _unit(posed), up_of(motion.slope)
     sole = soles_of(posed, points, motion) * size
     loss = level_term(sole, support.stands, up, weights.level)
-    loss = loss + balance_term(place_joints(posed, body, motion) * size, sole, support, up, fps, weights.balance)
+    joints = place_joints(posed, body, motion) * size
+    loss = loss + balance_term(joints, sole, support, up, fps, weights.balance, seconds)
     return weights.weight * loss + (motion.slope / weights.upright).square().sum()
 
 

@@ -256,6 +256,16 @@ def rate_of(seconds: Float[np.ndarray, "t"], fps: float) -> float:
     return fps if 1 / _SAME_RATE <= measured / fps <= _SAME_RATE else measured
 
 
+def are_uneven(seconds: Float[np.ndarray, "t"]) -> bool:
+    """Whether gaps between frames differ by more than a quarter of the usual one, as variable frame rates have them.
+
+    >>> are_uneven(np.array([0.0, 0.1, 0.2])), are_uneven(np.array([0.0, 0.1, 0.4]))
+    (False, True)
+    """
+    gaps = np.diff(seconds)
+    return len(gaps) > 1 and bool(np.ptp(gaps) > 0.5 * np.median(gaps))
+
+
 def _stem(clip: Path) -> str:
     return clip.stem if clip.is_file() else clip.name
 

@@ -140,7 +140,7 @@ def _rate(stated: Fraction | None, measured: float | None, path: Path, remarks: 
     if possible:
         remarks.append(
             f"{path.name} states {given:.4g} frames a second and its time stamps show {measured:.4g} on "
-            "average, which is taken; such videos have a variable frame rate."
+            "average, which is taken; such videos have a variable frame rate, and the fit uses the time of each image."
         )
     return measured
 
