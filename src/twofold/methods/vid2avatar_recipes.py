@@ -66,13 +66,15 @@ def vid2avatar_mask() -> Recipe:
 def vid2avatar_fast() -> Recipe:
     """`vid2avatar` with what makes it affordable and changes no equation, and shorter schedules: hours on a laptop."""
     recipe = _faster(vid2avatar())
-    # The weights of separation move on four epochs in one, so that they end where the long training does. A few epochs
-    # of few images leave a surface that is still too wide; to take it for the canonical one would keep it so.
-    separation = SeparationConfig(pace=4.0, in_shape=10.0)
+    # The weights of separation move on four epochs in one, so that they end where the long training does. In a short
+    # training whoever explains a pixel first keeps it. The background has to learn faster than the person grows, or
+    # the person becomes as wide as samples are placed; opacity inside the body has to count for more, or legs that
+    # hardly move become background, and not for much more, or thin chords of the outline make the person grow. A
+    # density that sharpens at once would freeze what is there, since no sample but the first one would have a gradient.
+    separation = SeparationConfig(pace=4.0, in_shape=4.0)
     scene = InvertedSphereFieldConfig(hidden_dtype="auto")
-    method = replace(
-        recipe.method, center="world", scene=scene, separation=separation, beta=0.01, rates=Vid2AvatarRates(scene=1e-3)
-    )
+    rates = Vid2AvatarRates(scene=2e-3, beta=3e-5)
+    method = replace(recipe.method, center="world", scene=scene, separation=separation, beta=0.008, rates=rates)
     return replace(recipe, name="vid2avatar_fast", method=method, training=replace(recipe.training, steps=1500))
 
 
