@@ -37,7 +37,7 @@ def test_tables_of_the_methods_are_up_to_date() -> None:
 
 def test_schedules_are_those_of_the_recipes() -> None:
     text = methods_with("<!-- schedules -->\n<!-- /schedules -->\n", {})
-    assert "| `humannerf_fast` | 400,000 | 1,500 |" in text
+    assert "| `humannerf_fast` | 400,000 | 3,000 |" in text
     assert "`motion_from` 200" in text
     assert "| `npc_fast` | 310,000 | 500 and 1,500 |" in text
 
