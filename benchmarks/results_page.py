@@ -158,6 +158,7 @@ def _studies(results: dict[str, Any]) -> list[str]:
         "study-ablation": "## What each part of the factorization is worth",
         "study-beyond": "## Beyond the paper: frequency bands by body part",
         "study-frequency": "## Frequencies of the two branches",
+        "study-main": "## The full model and the methods that the paper compares with",
     }
     return [
         f"{titles.get(name, f'## Study {name[6:]}')}\n\n{section(study, _table)}"

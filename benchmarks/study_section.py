@@ -91,10 +91,14 @@ def section(study: Mapping[str, Any], table: Table) -> str:
     return (
         f"By how much the full model is better (a negative number: worse): mean of the pairs ± their standard "
         f"deviation, pairs won; bold where the mean exceeds two standard errors; in parentheses the paper's difference "
-        f"on its subject 394. {_size(study, capital=True)}.\n\n{table(head, rows)}\n"
+        f"{_papers_subjects(study)}. {_size(study, capital=True)}.\n\n{table(head, rows)}\n"
         f"PSNR over the box in novel poses, by the distance to the nearest training pose (bins of equally many frames, "
         f"mean ± standard error over images):\n\n{table(head_extreme, extreme)}"
     )
+
+
+def _papers_subjects(study: Mapping[str, Any]) -> str:
+    return "over its subjects" if study.get("experiment") == "main" else "on its subject 394"
 
 
 def _words(difference: Difference, paper: float | None) -> str:
@@ -116,9 +120,10 @@ def _size(study: Mapping[str, Any], capital: bool = False) -> str:
     seeds, subjects = about["seeds"], len(about["subjects"])
     steps = sorted(set(study["steps"].values()))
     settings = f", {', '.join(f'`{s}`' for s in about['settings'])}" if about["settings"] else ""
+    size = f" of {about['size']} x {about['size']}" if about.get("size") else ""
     text = (
-        f"{subjects} held-out synthetic subject{'s' * (subjects > 1)}, {seeds} seed{'s' * (seeds > 1)} each, recipe "
-        f"`{about['recipe']}` with {' or '.join(map(str, steps))} steps{settings}"
+        f"{subjects} held-out synthetic subject{'s' * (subjects > 1)}{size}, {seeds} seed{'s' * (seeds > 1)} each, "
+        f"recipe `{about['recipe']}` with {' or '.join(map(str, steps))} steps{settings}"
     )
     return text[0].upper() + text[1:] if capital else text
 

@@ -103,7 +103,8 @@ def reproduce(
         return
     about: dict[str, object] = {
         "data": data, "recipe": recipe, "subjects": [source.name for source in sources], "seeds": seeds,
-        "settings": list(set), "measures": asdict(measures), **({} if steps is None else {"steps": steps}),
+        "settings": list(set), "measures": asdict(measures),
+        **{name: number for name, number in (("steps", steps), ("size", size)) if number is not None},
     }  # fmt: skip
     executor = _executor(cluster, cluster_hours, cluster_gpus, workers, out)
     failed = _do(plan, cells, out, executor, rates, table)
