@@ -1,6 +1,7 @@
 """Methods side by side: what `twofold compare` measured, stored with how each run was trained.
 
-`python -m benchmarks.methods COMPARISON NAME --capture "how it was made"` writes `results/methods-NAME.json`.
+`python -m benchmarks.methods COMPARISON NAME --capture "how it was made"` writes `results/methods-NAME.json`. With
+`--also` rows of other comparisons follow, of the same person in other images.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from twofold.methods.table import RECIPES, recipe_to_dict, with_steps
 from twofold.training.run import read_recipe
 
 IMAGE = ("psnr_box", "ssim_box", "silhouette_iou")
+SETTLED = ("seed", "method.field.follow_images")
+"""Settings that belong to a run or a capture."""
 COST = ("parameters", "training_processor_seconds", "frame_processor_seconds")
 
 
@@ -24,7 +27,7 @@ def settings_of(run: Path) -> list[str]:
     recipe = read_recipe(run)
     plain = with_steps(RECIPES[recipe.name](), recipe.method.total_steps(recipe.training))
     known, own = (_flat(recipe_to_dict(one)) for one in (plain, recipe))
-    return [f"{key}={value}" for key, value in own.items() if key != "seed" and value != known.get(key)]
+    return [f"{key}={value}" for key, value in own.items() if key not in SETTLED and value != known.get(key)]
 
 
 def stored(comparison: dict[str, Any], runs: Path, capture: str) -> dict[str, Any]:
@@ -66,10 +69,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.methods", description=__doc__)
     parser.add_argument("comparison", type=Path, help="folder that twofold compare made")
     parser.add_argument("name", help="of the file")
+    parser.add_argument("--also", type=Path, nargs="+", default=[])
     parser.add_argument("--runs", type=Path, required=True, help="folder that holds the runs")
     parser.add_argument("--capture", required=True, help="how the capture was made, for readers")
     given = parser.parse_args()
-    comparison = json.loads((given.comparison / "comparison.json").read_text("utf-8"))
+    parts = [json.loads((c / "comparison.json").read_text("utf-8")) for c in (given.comparison, *given.also)]
+    comparison = {**parts[0], "runs": [run for part in parts for run in part["runs"]]}
     write_json(RESULTS / f"methods-{given.name}.json", stored(comparison, given.runs, given.capture))
 
 
