@@ -88,12 +88,38 @@ def with_full_model(study: dict[str, Any], other: dict[str, Any]) -> dict[str, A
     return merged
 
 
+def with_rows_of(study: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """A study with the rows that another one of the same subjects has and it lacks, such as of a longer training.
+
+    Args:
+        study: from `collect`.
+        other: from `collect`.
+
+    Raises:
+        ValueError: it was trained on something else.
+    """
+    for key in ("data", "subjects", "size", "recipe", "settings"):
+        if study["about"].get(key) != other["about"].get(key):
+            raise ValueError(
+                f"{key} is {study['about'].get(key)!r} in one table, {other['about'].get(key)!r} in the other"
+            )
+    new = [row for row in other["rows"] if row not in study["rows"]]
+    merged = dict(study)
+    for part in ("rows", "steps", "printed"):
+        merged[part] = study[part] | {row: other[part][row] for row in new if row in other[part]}
+    bins = study["extreme"]["bins"] | {row: other["extreme"]["bins"][row] for row in new}
+    merged["extreme"] = study["extreme"] | {"bins": bins}
+    merged["cells"] = study["cells"] + [cell for cell in other["cells"] if cell["row"] in new]
+    return merged
+
+
 def main() -> None:
     """Collects and stores."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("table", type=Path)
     parser.add_argument("--name", default="")
     parser.add_argument("--full-of", type=Path, help="table whose full model is compared with")
+    parser.add_argument("--rows-of", type=Path, help="table with further rows, of other lengths")
     arguments = parser.parse_args()
 
     def collected(file: Path) -> dict[str, Any]:
@@ -102,6 +128,8 @@ def main() -> None:
     study = collected(arguments.table)
     if arguments.full_of is not None:
         study = with_full_model(study, collected(arguments.full_of))
+    if arguments.rows_of is not None:
+        study = with_rows_of(study, collected(arguments.rows_of))
     store(f"study-{arguments.name or study['experiment']}", study)
 
 

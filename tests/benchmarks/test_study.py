@@ -5,7 +5,7 @@ import json
 import pytest
 from stub_cells import store_results
 
-from benchmarks.study import collect, with_full_model
+from benchmarks.study import collect, with_full_model, with_rows_of
 from twofold.reproduce.cells import CELLS, store_cell
 from twofold.reproduce.experiments import planned
 from twofold.reproduce.sources import StudioSource
@@ -61,3 +61,16 @@ def test_full_model_that_was_trained_otherwise_is_refused(tmp_path):
     other = collected("ablation", ("full",), tmp_path / "b", 30.0, ["training.steps=8"])
     with pytest.raises(ValueError, match="settings is"):
         with_full_model(study, other)
+
+
+def test_rows_of_another_length_join_a_study_of_the_same_subjects(tmp_path):
+    study = collected("ablation", ("full", "wo_feat"), tmp_path / "a", 20.0)
+    other = collected("ablation", ("full", "pose_lf"), tmp_path / "b", 30.0)
+    merged = with_rows_of(study, other)
+    rows = {"Ours", "w/o feat", "Pose_lf"}
+    assert set(merged["rows"]) == set(merged["steps"]) == set(merged["extreme"]["bins"]) == rows
+    assert merged["rows"]["Ours"] == study["rows"]["Ours"] != other["rows"]["Ours"]
+    assert [cell["row"] for cell in merged["cells"]].count("Ours") == 1
+    assert "Pose_lf" not in study["rows"], "the study itself stays"
+    with pytest.raises(ValueError, match="settings is"):
+        with_rows_of(study, collected("ablation", ("full",), tmp_path / "c", 30.0, ["training.steps=8"]))
