@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import RESULTS
+from twofold.capture.folder import read_capture
 from twofold.files import write_json
-from twofold.methods.table import RECIPES, recipe_to_dict, with_steps
-from twofold.training.run import read_recipe
+from twofold.methods.table import RECIPES, fitted, recipe_to_dict, with_steps
+from twofold.training.run import find_capture, read_recipe
 
 IMAGE = ("psnr_box", "ssim_box", "silhouette_iou")
-SETTLED = ("seed", "method.field.follow_images")
-"""Settings that belong to a run or a capture."""
 COST = ("parameters", "training_processor_seconds", "frame_processor_seconds")
 
 
@@ -26,8 +25,9 @@ def settings_of(run: Path) -> list[str]:
     """What `--set` would have to change for the recipe of a run's name and length to be the run's own."""
     recipe = read_recipe(run)
     plain = with_steps(RECIPES[recipe.name](), recipe.method.total_steps(recipe.training))
+    plain, _ = fitted(plain, read_capture(find_capture(run, None)))
     known, own = (_flat(recipe_to_dict(one)) for one in (plain, recipe))
-    return [f"{key}={value}" for key, value in own.items() if key not in SETTLED and value != known.get(key)]
+    return [f"{key}={value}" for key, value in own.items() if key != "seed" and value != known.get(key)]
 
 
 def stored(comparison: dict[str, Any], runs: Path, capture: str) -> dict[str, Any]:
