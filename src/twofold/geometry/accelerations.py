@@ -17,6 +17,7 @@ def accelerations(
 
     which is $(x_{i+r} - 2 x_i + x_{i-r}) f^2 / r^2$ for frames at the even times $t_i = i / f$.
 
+    >>> import torch
     >>> fall = torch.tensor([0.0, 0.1, 0.3, 0.4])
     >>> accelerations(4.9 * fall**2, 7.5, fall).round(decimals=4)
     tensor([9.8000, 9.8000])
