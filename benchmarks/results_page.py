@@ -13,7 +13,7 @@ from typing import Any
 
 from benchmarks import sharpness_section
 from benchmarks.methods_section import schedules, side_by_side
-from benchmarks.study_section import answer, section
+from benchmarks.study_section import against_methods, answer, section
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, PAGE, README = ROOT / "benchmarks" / "results", ROOT / "docs" / "results.md", ROOT / "README.md"
@@ -57,10 +57,11 @@ def load(folder: Path = RESULTS) -> dict[str, Any]:
 def results_page(results: dict[str, Any]) -> str:
     """The page, Markdown."""
     machines = "; ".join(sorted(set(map(_machine, _benchmarks(results)))))
-    study = results.get("study-ablation")
+    study, main_study = results.get("study-ablation"), results.get("study-main")
+    others = against_methods(main_study) if main_study else ""
     parts = [
         "# Results\n\n"
-        + (f"{answer(study)}\n\n" if study else "")
+        + (f"{answer(study)}{others}\n\n" if study else "")
         + "Made from the JSON files in `benchmarks/results/` by `python -m benchmarks.results_page`. All "
         f"numbers are from CPUs: {machines}.\n",
         f"## Avatars and fits\n\n{_captures(results['captures'])}",

@@ -16,6 +16,7 @@ COMPARED = (
     ("geometry.chamfer_cm", "low", "Surface, mm", ""),
 )
 """Metric, which way is better, what it is called, the paper's column."""
+VERDICTS = {"better": "better than", "worse": "worse than", "undecided": "undecided against"}
 SCALE = {"novel_pose.gradient_error": 1000.0, "geometry.chamfer_cm": 10.0}
 
 Table = Callable[[Sequence[str], Iterable[Sequence[str]]], str]
@@ -52,11 +53,7 @@ def answer(study: Mapping[str, Any]) -> str:
     for name, found in (("novel poses", pose), ("novel views", view)):
         parts = [
             f"{word} {_listed([row for row, d in found.items() if d.verdict == verdict])}"
-            for word, verdict in (
-                ("better than", "better"),
-                ("worse than", "worse"),
-                ("undecided against", "undecided"),
-            )
+            for verdict, word in VERDICTS.items()
             if any(d.verdict == verdict for d in found.values())
         ]
         said.append(f"In {name} the full model is {'; '.join(parts)}.")
@@ -69,6 +66,15 @@ def answer(study: Mapping[str, Any]) -> str:
     else:
         said.append("At this scale an advantage over both single branches is not shown beyond the noise.")
     return " ".join(said)
+
+
+def against_methods(study: Mapping[str, Any]) -> str:
+    """A sentence: which of the methods that the paper compares with the full model beats by more than the noise."""
+    found = differences(study, *COMPARED[0][:2])
+    verdicts = {verdict: [row for row, d in found.items() if d.verdict == verdict] for verdict in VERDICTS}
+    parts = [f"{words} {_listed(verdicts[verdict])}" for verdict, words in VERDICTS.items() if verdicts[verdict]]
+    steps = " or ".join(f"{count:,}" for count in sorted(set(study["steps"].values())))
+    return f" Of the other methods, after {steps} steps each, it is {'; '.join(parts)} in novel poses." if parts else ""
 
 
 def section(study: Mapping[str, Any], table: Table) -> str:

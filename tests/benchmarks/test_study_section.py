@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.results_page import _table
-from benchmarks.study_section import answer, differences, section
+from benchmarks.study_section import against_methods, answer, differences, section
 
 SEEDS = range(4)
 
@@ -41,6 +41,15 @@ def test_answer_is_yes_where_the_full_model_beats_both_single_branches():
 def test_answer_is_no_where_a_single_branch_is_better():
     assert answer(study(26.0, s1c1=0.5, s2c2=-0.3)).endswith("A single branch does as well or better in novel poses: "
                                                              "at this scale, no.")  # fmt: skip
+
+
+def test_the_other_methods_are_named_by_verdict_with_their_steps():
+    found = study(26.0, s1c1=-0.5, feat=0.25)
+    found["steps"] = {"Ours": 350, "w/o {s1, c1}": 350, "w/o feat": 1200}
+    expected = (
+        " Of the other methods, after 350 or 1,200 steps each, it is better than w/o {s1, c1}; worse than w/o feat"
+    )
+    assert against_methods(found) == expected + " in novel poses."
 
 
 def test_one_pair_decides_nothing():
