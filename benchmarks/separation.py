@@ -19,7 +19,7 @@ from twofold.capture.folder import read_capture
 from twofold.capture.types import Capture, Frame, spread
 from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods.vid2avatar import Vid2Avatar
-from twofold.metrics.image import silhouette_iou
+from twofold.metrics.image import psnr, silhouette_iou
 from twofold.outputs.views import rays_at_once, render_image
 from twofold.training.clock import read_spent
 from twofold.training.run import CHECKPOINT, find_capture, load, read_recipe
@@ -49,7 +49,7 @@ def measured(avatar: Vid2Avatar, capture: Capture) -> dict[str, float]:
     for frame in spread(capture.train, MEASURED):
         image, whole, _, _, opacity = pieces(avatar, frame)
         overlaps.append(silhouette_iou(opacity[..., 0], frame.mask()))
-        errors.append(float(-10 * torch.log10((whole.clamp(0, 1) - image).square().mean())))
+        errors.append(psnr(whole.clamp(0, 1), image))
     return {"silhouette_iou": float(np.mean(overlaps)), "psnr_whole_image": float(np.mean(errors))}
 
 

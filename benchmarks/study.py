@@ -73,11 +73,7 @@ def with_full_model(study: dict[str, Any], other: dict[str, Any]) -> dict[str, A
         ValueError: it was trained otherwise.
     """
     (name,) = [row for row in other["rows"] if row in FULL]
-    for key in ("data", "recipe", "settings"):
-        if study["about"].get(key) != other["about"].get(key):
-            raise ValueError(
-                f"{key} is {study['about'].get(key)!r} in one table, {other['about'].get(key)!r} in the other"
-            )
+    _require_equal(study, other, ("data", "recipe", "settings"))
     merged = dict(study)
     for part in ("rows", "steps", "printed"):
         merged[part] = {row: v for row, v in study[part].items() if row not in FULL} | {name: other[part][name]}
@@ -98,11 +94,7 @@ def with_rows_of(study: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]
     Raises:
         ValueError: it was trained on something else.
     """
-    for key in ("data", "subjects", "size", "recipe", "settings"):
-        if study["about"].get(key) != other["about"].get(key):
-            raise ValueError(
-                f"{key} is {study['about'].get(key)!r} in one table, {other['about'].get(key)!r} in the other"
-            )
+    _require_equal(study, other, ("data", "subjects", "size", "recipe", "settings"))
     new = [row for row in other["rows"] if row not in study["rows"]]
     merged = dict(study)
     for part in ("rows", "steps", "printed"):
@@ -111,6 +103,13 @@ def with_rows_of(study: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]
     merged["extreme"] = study["extreme"] | {"bins": bins}
     merged["cells"] = study["cells"] + [cell for cell in other["cells"] if cell["row"] in new]
     return merged
+
+
+def _require_equal(study: dict[str, Any], other: dict[str, Any], keys: tuple[str, ...]) -> None:
+    for key in keys:
+        one, two = study["about"].get(key), other["about"].get(key)
+        if one != two:
+            raise ValueError(f"{key} is {one!r} in one table, {two!r} in the other")
 
 
 def main() -> None:

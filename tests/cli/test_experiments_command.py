@@ -147,12 +147,25 @@ def test_command_interrupted_twice_ends_with_the_same_table(person_folder, tmp_p
 
 
 def test_steps_are_those_of_every_cell_and_stand_with_the_table(tmp_path, capsys, quick_work):
-    words = ["reproduce", "main", "--out", str(tmp_path), "--methods", "npc", "factorized", "--steps", "40", *DEBUG]
+    words = [
+        "reproduce",
+        "main",
+        "--out",
+        str(tmp_path),
+        "--methods",
+        "npc",
+        "factorized",
+        "--steps",
+        "40",
+        "--max-images",
+        "6",
+        *DEBUG,
+    ]
     main(words)
     said = " ".join(capsys.readouterr().err.split())
     # The figures are of the same cells only with the same options.
     assert "Next: twofold reproduce figures --data studio" in said
-    assert "--steps 40" in said
+    assert "--steps 40 --max-images 6" in said
     found = [cells.read_cell(folder).recipe for folder in (tmp_path / "cells").iterdir()]
     assert sorted(recipe.method.total_steps(recipe.training) for recipe in found) == [40, 40]
     assert json.loads((tmp_path / "tables" / "main-studio-quick.json").read_text())["about"]["steps"] == 40

@@ -72,6 +72,8 @@ def test_a_part_that_no_image_shows_is_named_before_anything_is_written(
 ) -> None:
     cut = tuple(replace(f, camera=replace(f.camera, height=f.camera.height * 2 // 3)) for f in person.train)
     hidden = replace(person, splits={**person.splits, "train": cut})
-    with pytest.raises(TwofoldError, match=r"5 training images of .* show 0 % of the left knee and"):
+    with pytest.raises(
+        TwofoldError, match=r"5 training images of .* show 0 % of the left knee and .*; add training frames"
+    ):
         train(hidden, CASES["npc_fast"], tmp_path / "run", torch.device("cpu"))
     assert not (tmp_path / "run").exists()

@@ -111,8 +111,13 @@ def reproduce(
     file = _write(table, plan, out, about, stem)
     missing = sum(place.cell.results(out) is None for place in plan)
     words = ["twofold", "reproduce", table, "--data", data, "--recipe", recipe, "--out", str(out)]
-    chosen = {"--subjects": subjects, "--seeds": seeds if seeds > 1 else None, "--size": size, "--steps": steps}
-    words += [word for option, value in chosen.items() if value is not None for word in (option, str(value))]
+    # What decides which cells there are, and which of them count as measured.
+    chosen = {
+        "--subjects": (subjects, None), "--seeds": (seeds, 1), "--size": (size, None), "--steps": (steps, None),
+        "--max-images": (max_images, 30), "--max-meshes": (max_meshes, 2), "--weights": (weights, None),
+    }  # fmt: skip
+    words += [w for option, (value, usual) in chosen.items() if value != usual for w in (option, str(value))]
+    words += ["--unverified-weights"] if unverified_weights else []
     words += [word for setting in set for word in ("--set", setting)]
     if failed:
         raise TwofoldError(

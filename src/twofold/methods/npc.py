@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from twofold.capture.types import Capture
 from twofold.config import require_within
-from twofold.field.bone_boxes import RIGID_PARTS
+from twofold.field.bone_boxes import RIGID_PARTS, initial_half_sizes
 from twofold.geometry.cameras import Rays
 from twofold.losses import background, box_assignment, box_volumes
 from twofold.methods.base import Batch, MethodConfig, Mode, ParameterGroup, PosedAvatar, Rendering, Stage
@@ -133,8 +133,12 @@ class NpcAvatar(BoxedAvatar[Shared]):
         Raises:
             TwofoldError: see `require_points`.
         """
-        sizes = self.boxes().detach().cpu()[list(RIGID_PARTS)]
-        return require_points(capture, sizes, self.config.points, self.config.point_voxel)
+        return require_points(capture, self._first_sizes, self.config.points, self.config.point_voxel)
+
+    @property
+    def _first_sizes(self) -> Float[Tensor, "19 3"]:
+        """Half sizes of the rigid parts' boxes before they are trained, metres."""
+        return initial_half_sizes(self.rest_joints.cpu())[list(RIGID_PARTS)]
 
     def prepare_training(self, capture: Capture, stage: int, generator: torch.Generator) -> None:
         """See `Avatar.prepare_training`: the second stage begins with points on the surface of the first one's field.
@@ -144,8 +148,9 @@ class NpcAvatar(BoxedAvatar[Shared]):
         """
         if stage == 1:
             cameras = [(f.frame_index, f.camera) for f in capture.train]
-            sizes = self.boxes().detach().cpu()[list(RIGID_PARTS)]
-            self.begin_points(self.find_positions(unseen_parts(capture, sizes)), generator, len(cameras))
+            # By the boxes as they began, as `check_capture` told the user.
+            unseen = unseen_parts(capture, self._first_sizes)
+            self.begin_points(self.find_positions(unseen), generator, len(cameras))
             rows = torch.stack([torch.cat([c.world_to_camera, _intrinsics(c.intrinsics)]) for _, c in cameras])
             sizes = torch.tensor([[time, c.width, c.height] for time, c in cameras])
             self.cameras, self.camera_sizes = rows.to(self.device), sizes.to(self.device)
@@ -172,7 +177,7 @@ class NpcAvatar(BoxedAvatar[Shared]):
             for x in axes[0]
         ]
         volume = torch.stack(slabs).cpu().numpy()
-        body, _ = body_surface(self.subject.body, self.subject.betas)
+        body = body_surface(self.subject.body, self.subject.betas)[0] if unseen else None
         sizes = posed.own.half_sizes
         return surface_positions(volume, low, voxel, self.rest_joints, sizes, config.points, unseen, body)
 

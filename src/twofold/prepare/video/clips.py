@@ -257,7 +257,7 @@ def rate_of(seconds: Float[np.ndarray, "t"], fps: float) -> float:
 
 
 def are_uneven(seconds: Float[np.ndarray, "t"]) -> bool:
-    """Whether gaps between frames differ by more than a quarter of the usual one, as variable frame rates have them.
+    """Whether the longest gap between frames exceeds the shortest by more than half the usual one.
 
     >>> are_uneven(np.array([0.0, 0.1, 0.2])), are_uneven(np.array([0.0, 0.1, 0.4]))
     (False, True)
