@@ -67,8 +67,8 @@ def vid2avatar_fast() -> Recipe:
     """`vid2avatar` with what makes it affordable and changes no equation, and a short schedule."""
     recipe = _faster(vid2avatar())
     # The weights of separation move on four epochs in one, so that they end where the long training does. In a short
-    # training the field that explains a pixel first keeps it. The background has to learn faster than the person grows, or
-    # the person becomes as wide as samples are placed; opacity inside the body has to count for more, or legs that
+    # training the field that explains a pixel first keeps it. The background has to learn faster than the person grows,
+    # or the person becomes as wide as samples are placed; opacity inside the body has to count for more, or legs that
     # hardly move become background, and not for much more, or thin chords of the outline make the person grow. A
     # density that sharpens at once would freeze what is there, since no sample but the first one would have a gradient.
     separation = SeparationConfig(pace=4.0, in_shape=4.0)
