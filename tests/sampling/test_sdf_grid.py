@@ -1,10 +1,10 @@
-"""A table of distances never claims more than it knows."""
+"""A grid of distances claims no more than it knows, but for one place in a hundred."""
 
 import pytest
 import torch
 from little_body import ball
 
-from twofold.sampling.sdf_grid import tabulate
+from twofold.sampling.sdf_grid import KNOWN_BELOW, UNKNOWN, SdfGrid, grid_nodes, tabulate
 
 POINTS = torch.from_numpy(ball()[0])
 CENTER, RADIUS = POINTS.mean(0), float((POINTS - POINTS.mean(0)).norm(dim=1).mean())
@@ -32,7 +32,8 @@ def test_the_field_lies_between_the_bounds(field, least, most, device, generator
     x = around(20_000, 0.02, generator)
     nearer, further = (bound.cpu() for bound in table.bounds(x.to(device)))
     between = (nearer <= field(x)) & (field(x) <= further)
-    assert between.float().mean() > 0.999
+    # The error is that of 99 % of the places that were tried.
+    assert between.float().mean() > 0.985
     known = nearer.isfinite()
     assert known.float().mean() > 0.95
     torch.testing.assert_close((further - nearer)[known], torch.full((int(known.sum()),), 2 * table.error))
@@ -49,7 +50,7 @@ def test_every_node_is_asked_once_in_portions():
     asked = []
     table = tabulate(lambda x: asked.append(len(x)) or sphere(x), POINTS, 0.04, 0.06, chunk=100, trials=7)
     assert max(asked) == 100
-    assert sum(asked) == len(table) + 7
+    assert sum(asked) == int((table.values < KNOWN_BELOW).sum()) + 7
 
 
 def test_a_field_without_a_surface_is_tabulated_too():
@@ -57,3 +58,23 @@ def test_a_field_without_a_surface_is_tabulated_too():
     nearer, further = table.bounds(POINTS)
     torch.testing.assert_close(nearer, further)
     torch.testing.assert_close(nearer, torch.full((len(POINTS),), 3.0))
+
+
+def test_interpolation_is_exact_for_what_is_trilinear(device):
+    """Products of linear functions, against their own values."""
+
+    def trilinear(x):
+        return (1 + x[:, 0]) * (2 - x[:, 1]) * (0.5 + 3 * x[:, 2])
+
+    nodes = grid_nodes(POINTS.to(device), 0.03, 0.05)
+    grid = nodes.filled(trilinear(nodes.positions), 0.0)
+    x = around(500, 0.01, torch.Generator().manual_seed(0)).to(device)
+    torch.testing.assert_close(grid.interpolate(x), trilinear(x), atol=2e-5, rtol=0)
+
+
+def test_beside_a_node_that_is_not_known_nothing_is():
+    values = torch.zeros(3, 3, 3)
+    values[2, 2, 2] = UNKNOWN
+    grid = SdfGrid(values, torch.zeros(3), 1.0, 0.0)
+    x = torch.tensor([[1.5, 1.5, 1.5], [0.5, 0.5, 0.5], [-0.1, 0.5, 0.5], [1.9, 1.2, 2.1]])
+    assert grid.interpolate(x).isnan().tolist() == [True, False, True, True]

@@ -10,9 +10,8 @@ from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods.base import EVALUATION, Mode
 from twofold.methods.subject import Subject
 from twofold.sampling import shell_sampler
-from twofold.sampling.placement import FieldQuery
 from twofold.sampling.pruning import miswarped
-from twofold.sampling.shell import build_shell
+from twofold.sampling.shell import build_shell, expected_samples
 from twofold.sampling.shell_sampler import ShellSampler
 from twofold.training.loop import train
 
@@ -139,16 +138,43 @@ def test_strays_are_air_in_training_and_in_images(person):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"radius": 0.0}, {"step": -1.0}, {"sdf_grid_voxel": -0.1}, {"miswarp_slack": -0.01}, {"sdf_grid_voxel": 1e-3}],
+    [
+        {"radius": 0.0},
+        {"step": -1.0},
+        {"sdf_grid_voxel": -0.1},
+        {"miswarp_slack": -0.01},
+        {"sdf_grid_voxel": 1e-3},
+        {"training_grid_voxel": 1e-3},
+        {"training_grid_voxel": 0.6},
+    ],
 )
 def test_sizes_that_leave_nothing_to_sample_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"(radius|step|miswarp_slack|sdf_grid_voxel)=.* should be 0"):
+    with pytest.raises(ValueError, match=r"(radius|step|miswarp_slack|(sdf|training)_grid_voxel)=.* should be 0"):
         ShellSampler(**wrong)
 
 
-def test_a_table_is_for_dense_networks_only(person):
+def test_the_grid_of_small_networks_pays_for_large_images_only(person, monkeypatch):
     avatar = CASES["quick"].method.build(Subject.of(person)).eval()
     frame = person.train[0]
-    posed = avatar.pose(frame.pose, frame.translation)
-    query = FieldQuery(lambda x: x[:, 0], avatar.beta, avatar.field.dense)
-    assert avatar._sampler._grid(10**9, posed.own.surface, query) is None
+    rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
+    with torch.no_grad():
+        posed = avatar.pose(frame.pose, frame.translation)
+    found = {}
+    for pays in (10**9, 10):
+        monkeypatch.setattr(shell_sampler, "_GRID_PAYS", pays)
+        with torch.no_grad():
+            found[pays] = avatar.render(rays, posed, BLACK)
+        assert (avatar._sampler._last_grid is None) == (pays > 10)
+    assert found[10].opacity.max() > 0.9
+    for name in ("color", "opacity", "depth", "normal"):
+        torch.testing.assert_close(getattr(found[10], name), getattr(found[10**9], name), atol=4e-3, rtol=0)
+
+
+def test_expected_samples_are_about_those_that_there_are(dense, person):
+    frame = person.train[1]
+    rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1))
+    with torch.no_grad():
+        surface = dense.pose(frame.pose, frame.translation).own.surface
+        placed = dense._sampler.candidates(rays, surface, None)
+    expected = expected_samples(surface.shell, rays, dense.config.sampler.step)
+    assert 0.5 < expected / len(placed.samples) < 2

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from small_recipes import CASES
@@ -9,10 +10,12 @@ from small_recipes import CASES
 from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.geometry.surfaces import nearest_vertices
 from twofold.methods.subject import Subject
-from twofold.sampling import shell_sampler
+from twofold.sampling import search_kernels, shell_sampler
 from twofold.sampling.placement import FieldQuery
 from twofold.sampling.pruning import visible
+from twofold.sampling.sdf_grid import UNKNOWN, SdfGrid, tabulate
 from twofold.sampling.shell_sampler import ShellSampler
+from twofold.sampling.visibility import possible_samples
 from twofold.volume.rendering import composite, composite_weights, laplace_density
 
 
@@ -169,6 +172,56 @@ def test_steps_near_the_surface_are_divided_down_to_twice_the_scale(started):
         torch.testing.assert_close(gap, torch.full_like(gap, 0.003), atol=1e-5, rtol=0)
     # A finer walk from the same start finds the same surface: the light that comes through agrees.
     assert 0.9 < len(ray.unique()) / len(coarse.samples.ray_index.unique()) < 1.1
+
+
+@pytest.mark.parametrize(("beta", "radius", "finest"), [(0.002, 0.01, 0.0), (0.003, 0.02, 0.0), (0.002, 0.02, 0.003)])
+def test_a_grid_finds_the_samples_that_the_field_would_find(started, beta, radius, finest):
+    avatar, _, _ = started
+    walk, beta = walk_of(started, 0.011), torch.tensor(beta)
+    field, asked = BallField(avatar, radius), [BallField(avatar, radius) for _ in range(2)]
+    with torch.no_grad():
+        grid = tabulate(field, avatar.canonical_points, 0.015, 0.09)
+        every, found = (
+            walk.seen(FieldQuery(own, beta), 2e-3, share, finest, table)
+            for own, share, table in zip(asked, (0.0, 0.7), (None, grid), strict=True)
+        )
+    keys = [by_place(placed) for placed in (found, every)]
+    assert len(keys[1]) > 1000
+    # With divided steps the light is followed twice, first in whole steps that decide what is divided.
+    assert len(set(keys[0]) ^ set(keys[1])) <= (0.03 if finest else 0.005) * len(keys[1])
+    assert asked[1].asked < 0.95 * asked[0].asked
+    both = sorted(set(keys[0]) & set(keys[1]))
+    here, there = (torch.tensor([table[key] for key in both]) for table in keys)
+    for name in ("nearest", "weights", "x_canonical", "inverse"):
+        torch.testing.assert_close(getattr(found, name)[here], getattr(every, name)[there])
+
+
+def test_a_grid_that_knows_nothing_leaves_everything_to_the_field(started):
+    avatar, _, _ = started
+    walk, beta = walk_of(started, 0.011), torch.tensor(0.003)
+    empty = SdfGrid(torch.full((4, 4, 4), UNKNOWN), torch.zeros(3), 0.02, 0.0)
+    with torch.no_grad():
+        every, found = (walk.seen(FieldQuery(BallField(avatar), beta), 2e-3, 0.0, 0.0, g) for g in (None, empty))
+    assert set(by_place(found)) ^ set(by_place(every)) <= set()
+
+
+def test_bounds_of_a_grid_decide_like_possible_samples(started, generator):
+    """The compiled decision against that of `visibility.possible_samples`."""
+    avatar, _, _ = started
+    walk, beta = walk_of(started, 0.011), torch.tensor(0.003)
+    whole = walk.whole()
+    with torch.no_grad():
+        grid = tabulate(BallField(avatar), avatar.canonical_points, 0.02, 0.09)
+        nearer, further = grid.bounds(whole.x_canonical)
+        most, fewest = laplace_density(nearer, beta), laplace_density(further, beta)
+        wanted = possible_samples(whole.samples, fewest, most, 2e-3)
+    ray_at, number = whole.samples.ray_index.numpy(), np.arange(len(whole.samples))
+    possible = np.empty(len(number), bool)
+    own = np.float32(beta), np.float32(2e-3), np.float32(walk.step)
+    search_kernels.mark_possible(number, ray_at, whole.x_canonical.numpy(), grid.arrays(), *own, possible)
+    # What is not known lets no light through here, and all of it there.
+    assert (possible != wanted.numpy()).mean() < 0.002
+    assert 0.02 < possible.mean() < 0.98
 
 
 def test_a_finer_walk_and_a_divided_one_show_the_same_surface(started):

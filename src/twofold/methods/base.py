@@ -236,13 +236,9 @@ class Avatar(nn.Module, ABC, Generic[Own]):
 
     @abstractmethod
     def render(
-        self,
-        rays: Rays,
-        posed: PosedAvatar[Own],
-        background: Float[Tensor, "*r 3"] | None,
-        mode: Mode = EVALUATION,
+        self, rays: Rays, posed: PosedAvatar[Own], background: Float[Tensor, "*r 3"] | None, mode: Mode = EVALUATION,
         generator: torch.Generator | None = None,
-    ) -> Rendering:
+    ) -> Rendering:  # fmt: skip
         """What is seen along rays.
 
         Args:
@@ -277,13 +273,9 @@ class Avatar(nn.Module, ABC, Generic[Own]):
         return False
 
     def query(
-        self,
-        x_canonical: Float[Tensor, "S 3"],
-        posed: PosedAvatar,
-        to_observation: Float[Tensor, "S 3 3"] | None = None,
-        branch: str = "full",
-        lit: bool = True,
-    ) -> FieldOutput:
+        self, x_canonical: Float[Tensor, "S 3"], posed: PosedAvatar,
+        to_observation: Float[Tensor, "S 3 3"] | None = None, branch: str = "full", lit: bool = True,
+    ) -> FieldOutput:  # fmt: skip
         """The field at points of canonical space: signed distance, colour, canonical gradient.
 
         Args:
@@ -310,6 +302,11 @@ class Avatar(nn.Module, ABC, Generic[Own]):
         raise TwofoldError(f"{type(self).__name__} does not map points to canonical space; render it instead.")
 
     # ---- training
+
+    @property
+    def one_thread_each(self) -> bool:
+        """Whether PyTorch's operations are too small to be shared out; the method's compiled loops still are."""
+        return False
 
     def stages(self, training: TrainingConfig) -> tuple[Stage, ...]:
         """The stages of a training, one after the other; most methods have one."""

@@ -90,12 +90,13 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
         return terms
 
     @property
-    def _dense(self) -> bool:
-        return self.field.dense
-
-    @property
     def _two_branches(self) -> bool:
         return self.config.field.branches in ("both", "high_rendered")
+
+    @property
+    def one_thread_each(self) -> bool:
+        """See `Avatar.one_thread_each`: so it is with feature grids."""
+        return not self.field.dense
 
     def compiled(self) -> AbstractContextManager[bool]:
         """See `Avatar.compiled`. Feature grids have compiled loops of their own."""

@@ -32,6 +32,7 @@ from twofold.metrics.perceptual import LPIPS
 from twofold.sampling.placement import Deformation, FieldQuery, Placement, Sampler
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.shell import Shell
+from twofold.sampling.training_grid import TrainingGrid
 from twofold.volume.rendering import composite, composite_weights, laplace_density
 from twofold.volume.samples import Samples
 
@@ -83,14 +84,10 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         self._perceptual: tuple[LPIPS, ...] = ()
         self.deformation = Deformation(config.falloff, config.outlier_distance / self.scale, self.scale)
         self._sampler: Sampler = config.sampler.build(self.deformation, canonical.canonical_vertices, canonical.faces)
+        self.search: TrainingGrid | None = config.sampler.training_grid(canonical.canonical_vertices)
         self.completion: Completion | None = None
         if config.completion.active:
             self.completion = Completion(config.completion, given, canonical.canonical_vertices)
-
-    @property
-    def _dense(self) -> bool:
-        """Whether the field is made of large networks, so that a cached grid of distances pays."""
-        return True
 
     @property
     def _two_branches(self) -> bool:
@@ -104,8 +101,9 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
 
     def load_stored(self, state: dict[str, Tensor]) -> None:
         """See `Avatar.load_stored`."""
-        if self.completion is not None:
-            self.completion.take_on(state, "completion.")
+        for name in ("search", "completion"):
+            if (own := getattr(self, name)) is not None:
+                own.take_on(state, f"{name}.")
 
     def answer_beside(self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed) -> FieldOutput:
         """What completion takes its targets from and pulls to them, at canonical points beside these vertices."""
@@ -157,19 +155,22 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         if self.refinement.parts and step and step % refresh == 0 and step >= self.config.pose.refine_from:
             with torch.no_grad():
                 self._follow(*self._refined())
+        # In poses that do not depend on what this step shows: so any number of processes find the same.
+        if self.search is not None and mode.training and self.search.is_due(step):
+            self.search.refresh(self.field.sdf_at(self._posed(0, mode).own.condition))
         if (own := self.completion) is not None and own.is_due(step):
-            # In the first frame's pose, whatever this step shows: so any number of processes find the same.
-            subject = self.subject
-            posed = self.pose(subject.poses[0], subject.translations[0], int(subject.times[0]), mode)
+            posed = self._posed(0, mode)
             own.refresh(lambda x, v: self.answer_beside(x, v, posed), self.light_beside(own.beside, posed))
+
+    def _posed(self, row: int, mode: Mode) -> Posed:
+        """The avatar in the pose of a training frame."""
+        subject = self.subject
+        return self.pose(subject.poses[row], subject.translations[row], int(subject.times[row]), mode)
 
     def _refined(self) -> tuple[Tensor, Tensor]:
         """Poses and translations of all training frames with their corrections."""
-        subject = self.subject
-        found = [
-            self.refinement(int(time), pose.to(self.device), translation.to(self.device))
-            for time, pose, translation in zip(subject.times, subject.poses, subject.translations, strict=True)
-        ]
+        given = zip(self.subject.times, self.subject.poses, self.subject.translations, strict=True)
+        found = [self.refinement(int(time), p.to(self.device), t.to(self.device)) for time, p, t in given]
         return torch.stack([pose for pose, _ in found]), torch.stack([translation for _, translation in found])
 
     def _follow(self, poses: Tensor, translations: Tensor) -> None:
@@ -301,7 +302,9 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
     def place(self, rays: Rays, posed: Posed, mode: Mode, generator: torch.Generator | None) -> Placement:
         """The samples that `render` shades."""
         version = (self._steps, *(parameter._version for parameter in self.field.parameters()))
-        query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, self._dense, version)
+        query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, version)
+        if self.search is not None and mode.training:
+            query = replace(query, distance=self.search.watching(query.distance), grid=self.search.grid)
         placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
         shading = self.config.outliers_in_shading and not mode.training
         return placed if shading else replace(placed, outlier=torch.zeros_like(placed.outlier))

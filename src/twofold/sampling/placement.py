@@ -1,6 +1,5 @@
 """Samples placed on rays and mapped to canonical space: what every sampler of a body-based method returns."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -11,10 +10,8 @@ from torch import Tensor
 from twofold.deform.skinning import map_to_canonical, weights_by, with_pose_gradient
 from twofold.geometry.cameras import Rays
 from twofold.sampling.posed_surface import PosedSurface
+from twofold.sampling.sdf_grid import Distance, SdfGrid
 from twofold.volume.samples import Samples
-
-Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
-"""A field's signed distance at canonical points, metres."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +40,15 @@ class FieldQuery:
     Attributes:
         distance: signed distance at canonical points, metres.
         beta: scale of the Laplace density, metres.
-        dense: whether a query passes through large networks, so that a cached grid of distances pays.
         version: changes whenever the field's parameters do.
+        grid: these distances on a grid, nearly everywhere within its error of them, while the field is trained; a
+            sampler may look there first.
     """
 
     distance: Distance
     beta: Float[Tensor, ""]
-    dense: bool = False
     version: tuple[int, ...] = ()
+    grid: SdfGrid | None = None
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Which placed samples are worth shading: neither mis-warped nor known to be empty or hidden."""
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -7,10 +8,10 @@ from torch import Tensor
 from twofold.geometry.cameras import Rays
 from twofold.kernels.parallel import in_parts
 from twofold.sampling import shell_kernels
-from twofold.sampling.placement import Distance, Placement
+from twofold.sampling.placement import Placement
 from twofold.sampling.posed_surface import PosedSurface
-from twofold.sampling.sdf_grid import SdfGrid
-from twofold.sampling.shell import Shell, nearest_listed
+from twofold.sampling.sdf_grid import Distance, SdfGrid
+from twofold.sampling.shell import Shell, nearest_listed, shell_arrays
 from twofold.sampling.visibility import possible_samples, seen_samples
 from twofold.volume.rendering import laplace_density
 from twofold.volume.samples import Samples
@@ -29,9 +30,9 @@ def miswarped(
     points = placed.samples.points(rays)
     if not points.is_cuda and points.dtype == torch.float32:
         wrong = torch.empty(len(points), dtype=torch.bool)
-        given = (points, placed.x_canonical, placed.nearest[:, 0], surface.body.vertices.detach(), canonical.low)
-        lists = (canonical.row.numpy(), canonical.nearest.numpy(), canonical.vertices.numpy())
-        arrays = (*(tensor.contiguous().numpy() for tensor in given), canonical.voxel, *lists, slack, wrong.numpy())
+        given = (points, placed.x_canonical, placed.nearest[:, 0], surface.body.vertices.detach())
+        own = (tensor.contiguous().numpy() for tensor in given)
+        arrays = (*own, shell_arrays(canonical), np.float32(slack), wrong.numpy())
         in_parts(len(points), lambda begin, end: shell_kernels.miswarped(*arrays, begin, end))
         return wrong
     away = (points - surface.body.vertices[placed.nearest[:, 0]]).norm(dim=-1)

@@ -199,6 +199,16 @@ def sample_shell(
     return Samples(ray_ids[ray[close]], depth, torch.full_like(depth, step)), nearest[close], squared[close]
 
 
+def expected_samples(shell: Shell, rays: Rays, step: float) -> float:
+    """About how many samples, `step` metres apart, the rays have in the shell.
+
+    It fills a certain part of its box, and so it does of the rays' way through the box.
+    """
+    clipped, hit = clip_to_box(rays, shell.low, shell.high)
+    way = torch.where(hit, clipped.far - clipped.near, 0.0).sum()
+    return float(way) / step * len(shell.nearest) / max(shell.row.numel(), 1)
+
+
 def ray_starts(
     shell: Shell, rays: Rays, generator: torch.Generator | None
 ) -> tuple[Rays, Int[Tensor, "r"], Float[Tensor, "r"]]:

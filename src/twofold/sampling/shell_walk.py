@@ -1,7 +1,8 @@
 """Samples in a shell with their way to canonical space, found in compiled loops on CPUs."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ from torch import Tensor
 from twofold.geometry.cameras import Rays
 from twofold.kernels.lanes import LANES
 from twofold.kernels.parallel import in_parts
-from twofold.sampling import visibility_kernels, walk_kernels
+from twofold.sampling import search_kernels, visibility_kernels, walk_kernels
 from twofold.sampling.placement import Deformation, FieldQuery, Placement
+from twofold.sampling.sdf_grid import SdfGrid
 from twofold.sampling.shell import Shell, listed_on_rays, ray_arrays, ray_starts, shell_arrays
 from twofold.volume.samples import Samples
 
@@ -23,10 +25,16 @@ _STRETCH = 8
 """Candidates of the first round where rays do not leap; the next rounds take two, three times this number."""
 _FEW = 256
 """Candidates that are worth a thread of their own: a round of a training step has about a thousand."""
+_FEW_RAYS = 64
+"""Rays that are worth a thread of their own."""
 _Leap = tuple[float, np.ndarray, np.ndarray]
 """Share of the distance to the surface that a ray leaps over; each ray's next candidate, and where these end."""
+_OnRays = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Number of the ray, depth and row of the shell's lists of candidates, ray by ray."""
 _GOOD = 6
 """Arrays that describe the samples in what `walk_kernels.map_candidates` returns; the others are of those left out."""
+_FOLLOWED = (0, 3, 5)
+"""Those of them that a ray is followed by: number, canonical point, distance to the body's nearest vertex."""
 
 
 def can_walk(shell: Shell, rays: Rays) -> bool:
@@ -59,16 +67,21 @@ class Walk:
         ray_ids: which rays meet the shell's box.
         step: distance between samples, metres.
         k: how many nearest vertices count.
-        on_rays: number (among `ray_ids`), depth and row of the shell's lists of every candidate, ray by ray.
-        given: what `walk_kernels.map_candidates` takes before these.
+        given: what `walk_kernels.map_candidates` takes before the candidates.
         spacing: how far the body's surface may be from the nearest of its vertices, metres.
+        chosen: some candidates, as `on_rays` has all; None for all.
     """
 
     ray_ids: Tensor
     step: float
-    on_rays: tuple[np.ndarray, np.ndarray, np.ndarray]
     given: Any
     spacing: float = 0.0
+    chosen: _OnRays | None = None
+
+    @cached_property
+    def on_rays(self) -> _OnRays:
+        """Number (among `ray_ids`), depth and row of the shell's lists of every candidate, ray by ray."""
+        return self.chosen or listed_on_rays(self.given[0], self.given[1], len(self.ray_ids))
 
     @torch.no_grad()
     def whole(self) -> Placement:
@@ -76,7 +89,9 @@ class Walk:
         return self._placement(*self._mapped(np.arange(len(self.on_rays[0])))[:_GOOD])
 
     @torch.no_grad()
-    def seen(self, query: FieldQuery, least: float, share: float, finest: float = 0.0) -> Placement:
+    def seen(
+        self, query: FieldQuery, least: float, share: float, finest: float = 0.0, grid: SdfGrid | None = None
+    ) -> Placement:
         r"""The samples of `whole` that `visible` would choose, found without a look at most others.
 
         Rays are followed from front to back, a few samples at a time, and no further once less than `least` of their
@@ -94,21 +109,42 @@ class Walk:
                 space, so less than one.
             finest: the steps of the samples found are divided until these are at most $2 \beta$ long, or this, metres;
                 0 leaves them.
+            grid: of the field's distances. Rays are followed by it, and the field is only asked about what may count.
         """
-        coarse = self._search(query, least, share)
         parts = parts_of_step(self.step, float(query.beta.detach()), finest)
-        if parts == 1 or len(coarse[0]) == 0:
-            return self._placement(*coarse)
-        shell, rays = self.given[0], self.given[1]
-        on_rays = walk_kernels.divide(shell, rays, self.on_rays, coarse[0], parts)
-        return Walk(self.ray_ids, self.step / parts, on_rays, self.given, self.spacing)._seen_of_all(query, least)
+        if grid is None:
+            coarse = self._search(query, least, share)
+            if parts == 1 or len(coarse[0]) == 0:
+                return self._placement(*coarse)
+            found = tuple(array[coarse[0]] for array in self.on_rays)
+        else:
+            found = self._search_by(grid, query, least, share)
+        if parts > 1:
+            found = walk_kernels.divide(self.given[0], self.given[1], found, parts)
+        return replace(self, step=self.step / parts, chosen=found)._seen_of_all(query, least, grid)
 
-    def _seen_of_all(self, query: FieldQuery, least: float) -> Placement:
-        """`seen`, of which every sample is looked at, in one go."""
+    def _seen_of_all(self, query: FieldQuery, least: float, grid: SdfGrid | None) -> Placement:
+        """`seen`, of which every sample is looked at, in one go, unless a grid knows that it does not count."""
         found = self._mapped(np.arange(len(self.on_rays[0])))[:_GOOD]
+        asked = np.arange(len(found[0])) if grid is None else self._possible(grid, found, query, least)
         through = np.ones(len(self.ray_ids), np.float32)
-        seen = self._follow(found, query, least, through, None)
+        number, point, away = (found[part][asked] for part in _FOLLOWED)
+        seen = asked[self._follow(number, point, away, query, least, through, None)]
         return self._placement(*(array[seen] for array in found))
+
+    def _possible(self, grid: SdfGrid, found: list[np.ndarray], query: FieldQuery, least: float) -> np.ndarray:
+        """Which of these mapped candidates may count by what a grid knows."""
+        possible = np.empty(len(found[0]), bool)
+        light = np.float32(query.beta.detach()), np.float32(least), np.float32(self.step)
+        search_kernels.mark_possible(found[0], self.on_rays[0], found[3], grid.arrays(), *light, possible)
+        return np.flatnonzero(possible)
+
+    def _search_by(self, grid: SdfGrid, query: FieldQuery, least: float, share: float) -> _OnRays:
+        """The candidates that may count by what a grid knows."""
+        numbers = float(query.beta.detach()), least, share, self._guard(query, least)
+        light = tuple(np.float32(number) for number in numbers)
+        given = (*self.given, grid.arrays(), light, np.float32(self.spacing))
+        return _joined(in_parts(len(self.ray_ids), lambda b, e: search_kernels.search(*given, b, e), least=_FEW_RAYS))
 
     def _search(self, query: FieldQuery, least: float, share: float) -> list[np.ndarray]:
         """What `_mapped` says of the samples that `seen` looks for, in steps of the walk."""
@@ -130,7 +166,8 @@ class Walk:
             if share > 0 and len(too_far):
                 visibility_kernels.leap_to_shell(too_far, excess, *self.on_rays[:2], place, ends)
             if len(found[0]):
-                seen = self._follow(found, query, least, through, (share, place, ends))
+                number, point, away = (found[part] for part in _FOLLOWED)
+                seen = self._follow(number, point, away, query, least, through, (share, place, ends))
                 kept.append([array[seen] for array in found])
         if not kept:
             return self._mapped(index[:0])[:_GOOD]
@@ -139,12 +176,13 @@ class Walk:
         return [array[order] for array in found]
 
     def _follow(
-        self, found: list[np.ndarray], query: FieldQuery, least: float, through: np.ndarray, leap: _Leap | None
-    ) -> np.ndarray:
+        self, number: np.ndarray, point: np.ndarray, away: np.ndarray, query: FieldQuery, least: float,
+        through: np.ndarray, leap: _Leap | None,
+    ) -> np.ndarray:  # fmt: skip
         """Which of these candidates add more than `least`; the light left on each ray is reduced by all of them."""
-        number, away = found[0], np.sqrt(np.maximum(found[_GOOD - 1] ** 2 - np.float32(self.spacing**2), 0))
+        away = np.sqrt(np.maximum(away**2 - np.float32(self.spacing**2), 0))
         beta, seen, none = query.beta.detach(), np.empty(len(number), bool), np.zeros(0, np.int64)
-        sdf = query.distance(torch.from_numpy(found[3])).float().contiguous().numpy()
+        sdf = query.distance(torch.from_numpy(point)).float().contiguous().numpy()
         guard = self._guard(query, least)
         share, place, ends = leap or (0.0, none, none)
         light = np.float32(beta), np.float32(self.step), through, np.float32(least), seen
@@ -160,8 +198,7 @@ class Walk:
     def _mapped(self, index: np.ndarray) -> list[np.ndarray]:
         """What `walk_kernels.map_candidates` says of these."""
         given = (*self.given, self.on_rays, index)
-        parts = in_parts(len(index), lambda begin, end: walk_kernels.map_candidates(*given, begin, end), least=_FEW)
-        return list(parts[0]) if len(parts) == 1 else [np.concatenate(part) for part in zip(*parts, strict=True)]
+        return list(_joined(in_parts(len(index), lambda b, e: walk_kernels.map_candidates(*given, b, e), least=_FEW)))
 
     def _placement(
         self, number: np.ndarray, vertex: np.ndarray, weight: np.ndarray, point: np.ndarray, inverse: np.ndarray,
@@ -204,4 +241,9 @@ def start_walk(
         own, lines, shell_arrays(canonical), np.float32(limit), np.float32(slack), smooth, np.float32(scale), rows,
         min(k, shell.nearest.shape[1]),
     )  # fmt: skip
-    return Walk(ray_ids, step, listed_on_rays(own, lines, len(ray_ids)), given, spacing)
+    return Walk(ray_ids, step, given, spacing)
+
+
+def _joined(parts: list[Any]) -> Any:
+    """Arrays found in parts, each as one."""
+    return parts[0] if len(parts) == 1 else tuple(np.concatenate(part) for part in zip(*parts, strict=True))

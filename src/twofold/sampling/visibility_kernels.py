@@ -6,6 +6,15 @@ import numpy as np
 
 from twofold.kernels.parallel import compiled, compiled_part
 
+_ONE, _HALF = np.float32(1), np.float32(0.5)
+
+
+@compiled_part
+def light_passing(distance, beta, delta):  # noqa: ANN001, ANN201
+    """Share of the light that passes a step of `delta` metres at this signed distance: e to the -density * delta."""
+    tail = _HALF * np.exp(-abs(distance) / beta)
+    return np.exp(-(tail if distance > 0 else _ONE - tail) / beta * delta)
+
 
 @compiled
 def next_stretch(first, through, start, length, min_weight, index):  # noqa: ANN001, ANN201
@@ -67,13 +76,11 @@ def follow_to_surface(  # noqa: ANN201
     skips those within `share` times the distance that is left to that. The surface is no further than the
     body's, `away` metres: a longer distance comes from a sample that is mapped to nowhere.
     """
-    one, half = np.float32(1), np.float32(0.5)
     for i in range(index.shape[0]):
         s, distance = index[i], sdf[i]
         r = ray_at[s]
-        tail = half * np.exp(-abs(distance) / beta)
-        passing = np.exp(-(tail if distance > 0 else one - tail) / beta * delta)
-        seen[i] = through[r] * (one - passing) > min_weight
+        passing = light_passing(distance, beta, delta)
+        seen[i] = through[r] * (_ONE - passing) > min_weight
         through[r] *= passing
         if share > 0 and s == place[r] - 1:
             _leap(r, depth_at[s] + share * (min(distance, away[i]) - guard), depth_at, place, ends)

@@ -23,7 +23,7 @@ from twofold.kernels.lanes import (
 )
 from twofold.kernels.parallel import compiled, compiled_part
 
-_FAR = np.float32(1e9)
+FAR = np.float32(1e9)
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
@@ -51,8 +51,8 @@ def candidates(shell, rays, begin, end):  # noqa: ANN001, ANN201
             depth = np.float32(near[r] + step * (i + start[r]))
             if depth >= far[r]:
                 break
-            x, y, z = _on_ray(origins[r], directions[r], depth)
-            at = _row_at(x, y, z, low, inverse, row)
+            x, y, z = on_ray(origins[r], directions[r], depth)
+            at = row_at(x, y, z, low, inverse, row)
             i += 1
             if at < 0:
                 # Nothing of the shell within -at - 1 voxels of this one's centre; a diagonal is kept in hand.
@@ -60,30 +60,30 @@ def candidates(shell, rays, begin, end):  # noqa: ANN001, ANN201
                 continue
             if count == room:
                 room *= 2
-                ray_of, depth_of, row_of = _grown(ray_of, room), _grown(depth_of, room), _grown(row_of, room)
+                ray_of, depth_of, row_of = grown(ray_of, room), grown(depth_of, room), grown(row_of, room)
             ray_of[count], depth_of[count], row_of[count] = r, depth, at
             count += 1
     return ray_of[:count], depth_of[:count], row_of[:count]
 
 
 @compiled
-def divide(shell, rays, on_rays, chosen, parts):  # noqa: ANN001, ANN201
-    """`parts` candidates evenly spread over the step of each of the `chosen` ones; arrays as in `candidates`."""
+def divide(shell, rays, on_rays, parts):  # noqa: ANN001, ANN201
+    """`parts` candidates evenly spread over the step of each of these; arrays as in `candidates`."""
     low, voxel, row = shell[0], shell[1], shell[2]
     origins, directions, near, far, _, step = rays
     ray_at, depth_at, _ = on_rays
-    room = chosen.shape[0] * parts
+    room = ray_at.shape[0] * parts
     ray_of, depth_of, row_of = np.empty(room, np.int64), np.empty(room, np.float32), np.empty(room, np.int32)
     count = 0
     inverse = np.float32(1 / voxel)
-    for s in chosen:
+    for s in range(ray_at.shape[0]):
         r = ray_at[s]
         for part in range(parts):
             depth = np.float32(depth_at[s] + step * ((part + 0.5) / parts - 0.5))
             if depth < near[r] or depth >= far[r]:
                 continue
-            x, y, z = _on_ray(origins[r], directions[r], depth)
-            at = _row_at(x, y, z, low, inverse, row)
+            x, y, z = on_ray(origins[r], directions[r], depth)
+            at = row_at(x, y, z, low, inverse, row)
             if at >= 0:
                 ray_of[count], depth_of[count], row_of[count] = r, depth, at
                 count += 1
@@ -118,27 +118,24 @@ def map_candidates(  # noqa: ANN201
     """
     nearest, vertices = shell[3], shell[4]
     other_low, other_voxel, other_row, other_nearest, other_vertices = canonical
-    ray_at, depth_at, row_at = found_on_rays
+    ray_at, depth_at, row_at_of = found_on_rays
     room = end - begin
     number_of, far_of = np.empty(room, np.int64), np.empty(room, np.int64)
     away_of, excess_of = np.empty(room, np.float32), np.empty(room, np.float32)
     vertex_of, weight_of = np.empty((room, k), np.int64), np.empty((room, k), np.float32)
     point_of, inverse_of = np.empty((room, 3), np.float32), np.empty((room, 12), np.float32)
-    found, squares, weights = np.zeros(LANES, np.int64), np.full(LANES, _FAR, np.float32), np.empty(k, np.float32)
-    around, buffer = np.full((3, LANES), _FAR, np.float32), np.empty((3, LANES), np.float32)
+    found, squares, weights = np.zeros(LANES, np.int64), np.full(LANES, FAR, np.float32), np.empty(k, np.float32)
+    around, buffer = np.full((3, LANES), FAR, np.float32), np.empty((3, LANES), np.float32)
     origins, directions = rays[0], rays[1]
     count = far = 0
     # Hardly any branch depends on the data, so the processor fetches the next samples' lists beforehand.
     for place in range(begin, end):
         i = index[place]
-        r, depth, at = ray_at[i], depth_at[i], row_at[i]
-        x, y, z = _on_ray(origins[r], directions[r], depth)
-        for j in range(nearest.shape[1]):
-            v = nearest[at, j]
-            around[0, j], around[1, j], around[2, j] = vertices[v, 0], vertices[v, 1], vertices[v, 2]
-        _nearest(x, y, z, around, nearest, at, buffer, found, squares)
-        _weigh(squares, smooth, scale, weights)
-        _map(x, y, z, found, weights, forward, buffer, inverse_of, point_of, count)
+        r, depth, at = ray_at[i], depth_at[i], row_at_of[i]
+        x, y, z = on_ray(origins[r], directions[r], depth)
+        find_nearest(x, y, z, at, nearest, vertices, around, buffer, found, squares)
+        weigh(squares, smooth, scale, weights)
+        map_back(x, y, z, found, weights, forward, buffer, inverse_of, point_of, count)
         number_of[count] = i
         for j in range(k):
             vertex_of[count, j], weight_of[count, j] = found[j], weights[j]
@@ -149,7 +146,7 @@ def map_candidates(  # noqa: ANN201
             far += 1
         away = away_of[count] - slack
         if kept and slack > 0 and away > 0:
-            kept = not _is_closer(
+            kept = not is_closer(
                 point_of[count, 0], point_of[count, 1], point_of[count, 2], away * away,
                 other_low, other_voxel, other_row, other_nearest, other_vertices,
             )  # fmt: skip
@@ -161,13 +158,13 @@ def map_candidates(  # noqa: ANN201
 
 
 @compiled_part
-def _on_ray(origin, direction, depth):  # noqa: ANN001, ANN202
+def on_ray(origin, direction, depth):  # noqa: ANN001, ANN201
     """The point of a ray at a depth."""
     return origin[0] + depth * direction[0], origin[1] + depth * direction[1], origin[2] + depth * direction[2]
 
 
 @compiled_part
-def _row_at(x, y, z, low, inverse, row):  # noqa: ANN001, ANN202
+def row_at(x, y, z, low, inverse, row):  # noqa: ANN001, ANN201
     """What `row` says of a point's voxel; outside of the grid -1."""
     a = int(np.floor((x - low[0]) * inverse))
     b = int(np.floor((y - low[1]) * inverse))
@@ -178,8 +175,11 @@ def _row_at(x, y, z, low, inverse, row):  # noqa: ANN001, ANN202
 
 
 @compiled_part
-def _nearest(x, y, z, around, listed, at, buffer, found, squares):  # noqa: ANN001, ANN202
-    """All vertices listed in a row and their squared distances, nearest first."""
+def find_nearest(x, y, z, at, listed, vertices, around, buffer, found, squares):  # noqa: ANN001, ANN201
+    """All vertices listed in a row and their squared distances, nearest first; `around` and `buffer` are work space."""
+    for j in range(listed.shape[1]):
+        v = listed[at, j]
+        around[0, j], around[1, j], around[2, j] = vertices[v, 0], vertices[v, 1], vertices[v, 2]
     dx = minus(fill(x), load(around, 0, 0))
     dy = minus(fill(y), load(around, 1, 0))
     dz = minus(fill(z), load(around, 2, 0))
@@ -196,7 +196,7 @@ def _nearest(x, y, z, around, listed, at, buffer, found, squares):  # noqa: ANN0
 
 
 @compiled_part
-def _weigh(squares, smooth, scale, weights):  # noqa: ANN001, ANN202
+def weigh(squares, smooth, scale, weights):  # noqa: ANN001, ANN201
     """Weights of the nearest vertices by their squared distances."""
     count = weights.shape[0]
     total = _ZERO
@@ -214,7 +214,7 @@ def _weigh(squares, smooth, scale, weights):  # noqa: ANN001, ANN202
 
 
 @compiled_part
-def _map(x, y, z, found, weights, forward, buffer, inverse, point, s):  # noqa: ANN001, ANN202
+def map_back(x, y, z, found, weights, forward, buffer, inverse, point, s):  # noqa: ANN001, ANN201
     """Row `s` of the blended transforms' inverses, [S 12], and of the points that they make of x, y, z."""
     mixed = scaled(weights[0], load(forward, found[0], 0))
     for j in range(1, weights.shape[0]):
@@ -240,9 +240,9 @@ def _map(x, y, z, found, weights, forward, buffer, inverse, point, s):  # noqa: 
 
 
 @compiled_part
-def _is_closer(x, y, z, square, low, voxel, row, nearest, vertices):  # noqa: ANN001, ANN202
+def is_closer(x, y, z, square, low, voxel, row, nearest, vertices):  # noqa: ANN001, ANN201
     """Whether a listed vertex of a shell is closer to a point than the root of `square`."""
-    at = _row_at(x, y, z, low, np.float32(1 / voxel), row)
+    at = row_at(x, y, z, low, np.float32(1 / voxel), row)
     if at < 0:
         return False
     for j in range(nearest.shape[1]):
@@ -254,7 +254,8 @@ def _is_closer(x, y, z, square, low, voxel, row, nearest, vertices):  # noqa: AN
 
 
 @compiled_part
-def _grown(old, room):  # noqa: ANN001, ANN202
+def grown(old, room):  # noqa: ANN001, ANN201
+    """A longer array that begins like `old`."""
     apart()
     new = np.empty(room, old.dtype)
     new[: old.shape[0]] = old

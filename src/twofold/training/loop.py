@@ -17,6 +17,7 @@ from twofold.capture.coverage import coverage_of
 from twofold.capture.types import Capture, Frame
 from twofold.errors import TwofoldError
 from twofold.files import plain_errors
+from twofold.kernels.parallel import one_thread_each
 from twofold.kernels.runtime import flush_denormals
 from twofold.methods.base import Avatar, Mode, Stage
 from twofold.methods.subject import Subject
@@ -200,6 +201,8 @@ def train(
         found = None if resume else avatar.check_capture(capture)
         first = before_first(avatar) if before_first else None
         notes = [note for note in (first, found, settled) if note]
+        if avatar.one_thread_each and device.type == "cpu":
+            at_the_end.enter_context(one_thread_each())
         if wants_compiling(config, device):
             notes.append(COMPILED if at_the_end.enter_context(avatar.compiled()) else NOTHING_COMPILED)
         if say and team.leads:

@@ -1,0 +1,190 @@
+"""Rays followed through a shell by a grid of signed distances, for CPUs; `shell_walk` has the arrays."""
+
+# pyright: reportMissingParameterType=false
+
+import numpy as np
+
+from twofold.kernels.lanes import LANES
+from twofold.kernels.parallel import compiled, compiled_part
+from twofold.sampling.sdf_grid import KNOWN_BELOW, UNKNOWN
+from twofold.sampling.visibility_kernels import light_passing
+from twofold.sampling.walk_kernels import FAR, find_nearest, grown, is_closer, map_back, on_ray, row_at, weigh
+
+_ZERO, _ONE = np.float32(0), np.float32(1)
+_KNOWN, _NOWHERE = np.float32(KNOWN_BELOW), np.float32(UNKNOWN)
+
+
+@compiled
+def search(  # noqa: ANN201
+    shell, rays, canonical, limit, slack, smooth, scale, forward, k, grid, light, spacing, begin, end  # noqa: ANN001
+):  # fmt: skip
+    """Ray, depth and row of the shell's lists for every step of rays begin..end that may add more than a little.
+
+    A ray is followed until the grid knows that too little light is left. Where the surface is further than the distance
+    from which on samples count, it leaps.
+
+    Args:
+        shell: of this and the next eight see `map_candidates`.
+        rays: see `candidates`.
+        canonical: see above.
+        limit: see above.
+        slack: see above.
+        smooth: see above.
+        scale: see above.
+        forward: see above.
+        k: see above.
+        grid: (values, low, inverse spacing, error) of an `SdfGrid`.
+        light: (scale of the density, least weight, share of a distance to leap, distance from which on samples count).
+        spacing: how far the body's surface may be from its nearest vertex, metres.
+        begin: first ray.
+        end: ray behind the last.
+    """
+    low, voxel, row = shell[0], shell[1], shell[2]
+    origins, directions, near, far, start, step = rays
+    beta, least, share, guard = light
+    nearest, vertices = shell[3], shell[4]
+    other_low, other_voxel, other_row, other_nearest, other_vertices = canonical
+    values, lowest, spaced, error = grid
+    found, squares, weights = np.zeros(LANES, np.int64), np.full(LANES, FAR, np.float32), np.empty(k, np.float32)
+    around, buffer = np.full((3, LANES), FAR, np.float32), np.empty((3, LANES), np.float32)
+    room = (end - begin) * 8 + 64
+    ray_of, depth_of, row_of = np.empty(room, np.int64), np.empty(room, np.float32), np.empty(room, np.int32)
+    point, transform = np.empty((1, 3), np.float32), np.empty((1, 12), np.float32)
+    count = 0
+    inverse = np.float32(1 / voxel)
+    for r in range(begin, end):
+        steps = int(np.ceil((far[r] - near[r]) / step))
+        through = _ONE
+        i = 0
+        while i < steps and through > least:
+            depth = np.float32(near[r] + step * (i + start[r]))
+            if depth >= far[r]:
+                break
+            x, y, z = on_ray(origins[r], directions[r], depth)
+            at = row_at(x, y, z, low, inverse, row)
+            i += 1
+            if at < 0:
+                i += max(0, int((-at - 3) * voxel / step))
+                continue
+            find_nearest(x, y, z, at, nearest, vertices, around, buffer, found, squares)
+            away = np.sqrt(squares[0])
+            if away >= limit:
+                i += max(0, int((away - limit) / step))
+                continue
+            weigh(squares, smooth, scale, weights)
+            map_back(x, y, z, found, weights, forward, buffer, transform, point, 0)
+            a, b, c = point[0, 0], point[0, 1], point[0, 2]
+            away -= slack
+            if (
+                slack > 0
+                and away > 0
+                and is_closer(a, b, c, away * away, other_low, other_voxel, other_row, other_nearest, other_vertices)
+            ):
+                continue
+            distance = _distance_at(a, b, c, values, lowest, spaced)
+            if distance < _KNOWN:
+                nearer = distance - error
+                if nearer > guard:
+                    # Not further than the body's surface: a longer distance belongs to a sample mapped to nowhere.
+                    body = np.sqrt(max(squares[0] - spacing * spacing, _ZERO))
+                    i += max(0, int(np.ceil(share * (min(nearer, body) - guard) / step)) - 1)
+                    continue
+                seen = through * (_ONE - light_passing(nearer, beta, step)) > least
+                through *= light_passing(distance + error, beta, step)
+                if not seen:
+                    continue
+            if count == room:
+                room *= 2
+                ray_of, depth_of, row_of = grown(ray_of, room), grown(depth_of, room), grown(row_of, room)
+            ray_of[count], depth_of[count], row_of[count] = r, depth, at
+            count += 1
+    return ray_of[:count], depth_of[:count], row_of[:count]
+
+
+@compiled
+def mark_possible(number, ray_at, point, grid, beta, least, step, possible):  # noqa: ANN001, ANN201
+    """possible[S] = whether a sample may add more than `least` to its pixel, by the bounds of a grid.
+
+    Args:
+        number: of each sample among the candidates, in their order.
+        ray_at: ray of each candidate.
+        point: canonical position of each sample, metres.
+        grid: see `search`.
+        beta: scale of the density, metres.
+        least: smallest weight that counts.
+        step: metres.
+        possible: the answer.
+    """
+    values, lowest, spaced, error = grid
+    ray, through = -1, _ONE
+    for i in range(number.shape[0]):
+        if ray_at[number[i]] != ray:
+            ray, through = ray_at[number[i]], _ONE
+        distance = _distance_at(point[i, 0], point[i, 1], point[i, 2], values, lowest, spaced)
+        if distance >= _KNOWN:
+            possible[i] = through > least
+            continue
+        possible[i] = through * (_ONE - light_passing(distance - error, beta, step)) > least
+        through *= light_passing(distance + error, beta, step)
+
+
+@compiled_part
+def _distance_at(x, y, z, values, low, inverse):  # noqa: ANN001, ANN202
+    """The trilinear distance of a grid at a point; huge where it is not known."""
+    u, v, w = (x - low[0]) * inverse, (y - low[1]) * inverse, (z - low[2]) * inverse
+    a, b, c = int(np.floor(u)), int(np.floor(v)), int(np.floor(w))
+    if a < 0 or b < 0 or c < 0 or a + 1 >= values.shape[0] or b + 1 >= values.shape[1] or c + 1 >= values.shape[2]:
+        return _NOWHERE
+    u, v, w = u - np.float32(a), v - np.float32(b), w - np.float32(c)
+    x00 = values[a, b, c] + w * (values[a, b, c + 1] - values[a, b, c])
+    x01 = values[a, b + 1, c] + w * (values[a, b + 1, c + 1] - values[a, b + 1, c])
+    x10 = values[a + 1, b, c] + w * (values[a + 1, b, c + 1] - values[a + 1, b, c])
+    x11 = values[a + 1, b + 1, c] + w * (values[a + 1, b + 1, c + 1] - values[a + 1, b + 1, c])
+    x0, x1 = x00 + v * (x01 - x00), x10 + v * (x11 - x10)
+    return x0 + u * (x1 - x0)
+
+
+@compiled
+def collect_residuals(x, sdf, values, low, inverse, pull, weight):  # noqa: ANN001, ANN201
+    """Adds to each node of a grid the residuals of points around it, and their weights; sum and count of |residual|.
+
+    Args:
+        x: points, metres.
+        sdf: their true distances, metres.
+        values: distances of the grid, metres; one of them flattened, like the next two.
+        low: first node, metres.
+        inverse: inverse spacing.
+        pull: sum of each node's weights times residuals.
+        weight: sum of its weights.
+    """
+    total, count = 0.0, 0
+    size_x, size_y, size_z = values.shape
+    for s in range(x.shape[0]):
+        u, v, w = (x[s, 0] - low[0]) * inverse, (x[s, 1] - low[1]) * inverse, (x[s, 2] - low[2]) * inverse
+        a, b, c = int(np.floor(u)), int(np.floor(v)), int(np.floor(w))
+        if a < 0 or b < 0 or c < 0 or a + 1 >= size_x or b + 1 >= size_y or c + 1 >= size_z:
+            continue
+        u, v, w = u - np.float32(a), v - np.float32(b), w - np.float32(c)
+        middle = _ZERO
+        for i in range(2):
+            for j in range(2):
+                for k in range(2):
+                    middle += _share(u, i) * _share(v, j) * _share(w, k) * values[a + i, b + j, c + k]
+        if middle >= _KNOWN:
+            continue
+        residual = sdf[s] - middle
+        total += abs(residual)
+        count += 1
+        for i in range(2):
+            for j in range(2):
+                for k in range(2):
+                    own = _share(u, i) * _share(v, j) * _share(w, k)
+                    pull[a + i, b + j, c + k] += own * residual
+                    weight[a + i, b + j, c + k] += own
+    return total, count
+
+
+@compiled_part
+def _share(part, upper):  # noqa: ANN001, ANN202
+    """Weight of the lower (0) or upper (1) node by the position between them."""
+    return part if upper == 1 else _ONE - part

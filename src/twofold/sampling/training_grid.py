@@ -1,0 +1,122 @@
+"""A grid of signed distances that follows a field while it is trained, and finds samples for the field to look at."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from twofold.sampling import search_kernels as kernels
+from twofold.sampling.sdf_grid import Distance, SdfGrid, differences, grid_nodes, query_nodes
+
+_EVERY = 200
+"""Steps between two queries of all nodes; at the beginning fewer, twice as many each time."""
+_TRIALS = 2048
+"""Places at which a new grid is compared with the field."""
+_SPREAD = 3.0
+"""Error of the grid in mean differences: of differences that fall off exponentially 95 % are smaller.
+
+Samples that just count lie one or two centimetres from the surface, so a difference beyond the error costs light that
+hardly anybody sees; and what the grid finds is shown to the field itself before it is shaded."""
+_RECENT = 0.1
+"""Weight of the newest step in the mean difference."""
+
+
+class TrainingGrid(nn.Module):
+    """Signed distances of a field around the canonical body, corrected wherever the field is asked.
+
+    Values and error are part of the state, so that a training that was interrupted finds the same samples.
+    """
+
+    values: Tensor
+    error: Tensor
+
+    def __init__(self, points: Float[Tensor, "n 3"], voxel: float, radius: float) -> None:
+        """Of a canonical body, with a spacing, as far from its vertices as samples are mapped; metres."""
+        super().__init__()
+        self._nodes = grid_nodes(points, voxel, radius)
+        self.register_buffer("values", self._nodes.filled(torch.zeros(len(self._nodes.positions)), 0.0).values)
+        # Negative until there are values.
+        self.register_buffer("error", torch.tensor(-1.0))
+
+    def is_due(self, step: int) -> bool:
+        """Whether all nodes are to be queried before this step."""
+        return step % _EVERY == 0 or (step < _EVERY and step & (step - 1) == 0)
+
+    @torch.no_grad()
+    def refresh(self, distance: Distance) -> None:
+        """Queries the field at all nodes."""
+        self._nodes = self._nodes.to(self.values.device)
+        values = query_nodes(self._nodes, distance)
+        new = self._nodes.filled(values, 0.0)
+        self.values.copy_(new.values)
+        if float(self.error) < 0:
+            places = self._nodes.near_surface(values, _TRIALS, torch.Generator().manual_seed(0))
+            self.error.fill_(_SPREAD * float(differences(new, distance, places).mean()))
+
+    @property
+    def grid(self) -> SdfGrid | None:
+        """The distances as they are now, or None before the first `refresh`."""
+        error, low = float(self.error), self._nodes.low.to(self.values.device)
+        return SdfGrid(self.values, low, self._nodes.voxel, error) if error >= 0 else None
+
+    def watching(self, distance: Distance) -> Distance:
+        """A field's distance, of which the grid learns whatever is asked."""
+
+        def watched(x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+            sdf = distance(x)
+            self.learn(x, sdf)
+            return sdf
+
+        return watched
+
+    @torch.no_grad()
+    def learn(self, x: Float[Tensor, "n 3"], sdf: Float[Tensor, "n"]) -> None:
+        r"""Moves the nodes around points towards the field's distances there, and the error towards what it was.
+
+        \[ v_k \leftarrow v_k + \frac{\sum_i w_{ik} (s_i - \tilde s(x_i))}{\sum_i w_{ik}}, \qquad
+            \epsilon \leftarrow 0.9 \, \epsilon + 0.1 \cdot 3 \, \overline{|s_i - \tilde s(x_i)|} \]
+
+        with the trilinear weights $w_{ik}$ of the points $x_i$.
+
+        Args:
+            x: points, metres.
+            sdf: the field's signed distances there, metres.
+        """
+        grid = self.grid
+        if grid is None or len(x) == 0:
+            return
+        pull, weight, mean = residuals(grid, x, sdf)
+        if mean is not None:
+            self.values += pull / weight.clamp_min(1e-6)
+            self.error += _RECENT * (_SPREAD * mean - self.error)
+
+    def take_on(self, state: dict[str, Tensor], prefix: str) -> None:
+        """Puts what a run of an earlier version lacks into its state: a grid without values."""
+        for name, own in self.state_dict().items():
+            state.setdefault(prefix + name, own)
+
+
+@torch.no_grad()
+def residuals(
+    grid: SdfGrid, x: Float[Tensor, "n 3"], sdf: Float[Tensor, "n"]
+) -> tuple[Float[Tensor, "X Y Z"], Float[Tensor, "X Y Z"], float | None]:
+    """Each node's sum of weights times residuals of the points around it, and of weights; the mean residual, absolute.
+
+    Args:
+        grid: of distances.
+        x: points, metres; those where the grid is not known are left out.
+        sdf: what the distances there should be, metres.
+    """
+    pull, weight = torch.zeros_like(grid.values), torch.zeros_like(grid.values)
+    if not x.is_cuda and x.dtype == torch.float32:
+        given = (t.contiguous().numpy() for t in (x, sdf.float()))
+        total, count = kernels.collect_residuals(*given, *grid.arrays()[:3], pull.numpy(), weight.numpy())
+        return pull, weight, total / count if count else None
+    middle, (index, weights) = grid.interpolate(x), grid.corners(x)
+    known = (~middle.isnan()).nonzero()[:, 0]
+    if len(known) == 0:
+        return pull, weight, None
+    residual = sdf.to(middle.dtype)[known] - middle[known]
+    index, weights = index[known].flatten(), weights[known]
+    pull.view(-1).index_add_(0, index, (weights * residual[:, None]).flatten())
+    weight.view(-1).index_add_(0, index, weights.flatten())
+    return pull, weight, float(residual.abs().mean())
