@@ -8,7 +8,7 @@ from small_recipes import CASES
 from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods.base import Mode
 from twofold.methods.subject import Subject
-from twofold.sampling.training_grid import TrainingGrid, residuals
+from twofold.sampling.training_grid import TrainingGrid, add_residuals
 
 POINTS = torch.from_numpy(ball()[0])
 CENTER, RADIUS = POINTS.mean(0), float((POINTS - POINTS.mean(0)).norm(dim=1).mean())
@@ -52,6 +52,7 @@ def test_it_follows_a_field_that_moves(grid, generator):
     for step in range(60):
         x = near(400, generator)
         grid.learn(x, sphere(x, grown=0.01 * min(step / 30, 1)))
+        grid.settle()
         errors.append(grid.grid.error)
     x = near(2000, generator)
     assert (grid.grid.interpolate(x) - sphere(x, grown=0.01)).abs().mean() < 0.0015
@@ -63,19 +64,29 @@ def test_a_distance_that_is_watched_teaches_it(grid):
     x = POINTS[:50] + 0.003
     watched = grid.watching(lambda x: sphere(x, grown=0.005))
     torch.testing.assert_close(watched(x), sphere(x, grown=0.005))
+    grid.settle()
     assert (grid.grid.interpolate(x) - sphere(x, grown=0.005)).abs().mean() < 0.003
 
 
 def test_residuals_are_those_of_the_twin_in_torch(grid, generator):
     x = torch.cat([near(300, generator), torch.tensor([[9.0, 9.0, 9.0]])])
     sdf = sphere(x, grown=0.004)
-    ours, twin = residuals(grid.grid, x, sdf), residuals(grid.grid, x.double(), sdf)
+    ours, twin = add_residuals(grid.grid, x, sdf), add_residuals(grid.grid, x.double(), sdf)
+    assert ours[2][1] == 300
     for one, other in zip(ours, twin, strict=True):
-        torch.testing.assert_close(
-            torch.as_tensor(one), torch.as_tensor(other), atol=1e-6, rtol=1e-4, check_dtype=False
-        )
-    assert residuals(grid.grid, x[-1:], sdf[-1:])[2] is None
-    assert residuals(grid.grid, x[-1:].double(), sdf[-1:])[2] is None
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-4)
+    once = [tensor.clone() for tensor in ours]
+    again = add_residuals(grid.grid, x, sdf, ours)
+    for one, other in zip(again, once, strict=True):
+        torch.testing.assert_close(one, 2 * other)
+
+
+def test_points_beyond_the_grid_change_nothing(grid):
+    before = grid.values.clone(), grid.error.clone()
+    grid.learn(torch.full((3, 3), 9.0), torch.zeros(3))
+    grid.settle()
+    assert torch.equal(grid.values, before[0])
+    assert torch.equal(grid.error, before[1])
 
 
 def test_it_is_queried_more_often_at_the_beginning(grid):

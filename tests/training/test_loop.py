@@ -228,6 +228,21 @@ def test_compiled_networks_learn_what_plain_ones_do(person: Capture, tmp_path: P
     assert_same(plain, compiled, 1e-4)
 
 
+@pytest.mark.parametrize(("case", "threads"), [("quick", 1), ("fast", 2)])
+def test_only_the_small_operations_of_feature_grids_take_one_thread_each(
+    person: Capture, tmp_path: Path, case: str, threads: int
+) -> None:
+    before, found = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+    try:
+        recipe = replace(CASES[case], training=replace(CASES[case].training, steps=1, preview_every=0))
+        train(person, recipe, tmp_path / "run", CPU, progress=lambda _: found.append(torch.get_num_threads()))
+        assert found == [threads]
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_training_lowers_the_loss(trained: Run) -> None:
     seen = [sum(progress.losses.values()) for progress in trained.told]
     assert sum(seen[-10:]) < 0.7 * sum(seen[:10])

@@ -187,7 +187,9 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
             self._shells.pop(row, None)
 
     def after_step(self, mode: Mode, capture: Capture) -> Literal["continue", "restart"]:
-        """Takes out of the corrections what no training camera sees, where that is asked for."""
+        """Takes out of the corrections what no training camera sees, where that is asked for; see `TrainingGrid`."""
+        if self.search is not None:
+            self.search.settle()
         pose = self.config.pose
         if pose.observed_only and self.refinement.parts and (mode.step or 0) >= pose.refine_from:
             if self._observed is None:

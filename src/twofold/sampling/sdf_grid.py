@@ -168,7 +168,7 @@ def tabulate(
 
 @torch.no_grad()
 def query_nodes(nodes: GridNodes, distance: Distance, chunk: int = 65_536) -> Float[Tensor, "N"]:
-    """A field's signed distance at the nodes, metres, of so many at once."""
+    """A field's signed distance at the nodes, metres; `chunk` of them are queried at once."""
     return torch.cat([distance(part) for part in nodes.positions.split(chunk)]).float()
 
 

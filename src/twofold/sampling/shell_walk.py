@@ -109,7 +109,7 @@ class Walk:
                 space, so less than one.
             finest: the steps of the samples found are divided until these are at most $2 \beta$ long, or this, metres;
                 0 leaves them.
-            grid: of the field's distances. Rays are followed by it, and the field is only asked about what may count.
+            grid: of the field's distances. Rays are followed by it, and the field is queried only where samples may count.
         """
         parts = parts_of_step(self.step, float(query.beta.detach()), finest)
         if grid is None:
@@ -126,10 +126,10 @@ class Walk:
     def _seen_of_all(self, query: FieldQuery, least: float, grid: SdfGrid | None) -> Placement:
         """`seen`, of which every sample is looked at, in one go, unless a grid knows that it does not count."""
         found = self._mapped(np.arange(len(self.on_rays[0])))[:_GOOD]
-        asked = np.arange(len(found[0])) if grid is None else self._possible(grid, found, query, least)
+        queried = np.arange(len(found[0])) if grid is None else self._possible(grid, found, query, least)
         through = np.ones(len(self.ray_ids), np.float32)
-        number, point, away = (found[part][asked] for part in _FOLLOWED)
-        seen = asked[self._follow(number, point, away, query, least, through, None)]
+        number, point, away = (found[part][queried] for part in _FOLLOWED)
+        seen = queried[self._follow(number, point, away, query, least, through, None)]
         return self._placement(*(array[seen] for array in found))
 
     def _possible(self, grid: SdfGrid, found: list[np.ndarray], query: FieldQuery, least: float) -> np.ndarray:

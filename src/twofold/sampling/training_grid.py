@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from twofold.kernels.parallel import summed_over_processes
 from twofold.sampling import search_kernels as kernels
 from twofold.sampling.sdf_grid import Distance, SdfGrid, differences, grid_nodes, query_nodes
 
@@ -16,12 +17,14 @@ _SPREAD = 3.0
 
 Samples that just count lie one or two centimetres from the surface, so a difference beyond the error costs light that
 hardly anybody sees; and what the grid finds is shown to the field itself before it is shaded."""
+Residuals = tuple[Tensor, Tensor, Tensor]
+"""See `add_residuals`."""
 _RECENT = 0.1
 """Weight of the newest step in the mean difference."""
 
 
 class TrainingGrid(nn.Module):
-    """Signed distances of a field around the canonical body, corrected wherever the field is asked.
+    """Signed distances of a field around the canonical body, corrected wherever the field is queried.
 
     Values and error are part of the state, so that a training that was interrupted finds the same samples.
     """
@@ -36,6 +39,7 @@ class TrainingGrid(nn.Module):
         self.register_buffer("values", self._nodes.filled(torch.zeros(len(self._nodes.positions)), 0.0).values)
         # Negative until there are values.
         self.register_buffer("error", torch.tensor(-1.0))
+        self._noted: Residuals | None = None
 
     def is_due(self, step: int) -> bool:
         """Whether all nodes are to be queried before this step."""
@@ -59,7 +63,7 @@ class TrainingGrid(nn.Module):
         return SdfGrid(self.values, low, self._nodes.voxel, error) if error >= 0 else None
 
     def watching(self, distance: Distance) -> Distance:
-        """A field's distance, of which the grid learns whatever is asked."""
+        """A field's distance, that also teaches the grid what it returns."""
 
         def watched(x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
             sdf = distance(x)
@@ -70,24 +74,29 @@ class TrainingGrid(nn.Module):
 
     @torch.no_grad()
     def learn(self, x: Float[Tensor, "n 3"], sdf: Float[Tensor, "n"]) -> None:
-        r"""Moves the nodes around points towards the field's distances there, and the error towards what it was.
+        """Takes note of a field's distances at points, metres, for `settle`."""
+        grid = self.grid
+        if grid is not None and len(x):
+            self._noted = add_residuals(grid, x, sdf, self._noted)
+
+    @torch.no_grad()
+    def settle(self) -> None:
+        r"""Moves the nodes towards the distances that were noted in a step, and the error towards what it was.
 
         \[ v_k \leftarrow v_k + \frac{\sum_i w_{ik} (s_i - \tilde s(x_i))}{\sum_i w_{ik}}, \qquad
             \epsilon \leftarrow 0.9 \, \epsilon + 0.1 \cdot 3 \, \overline{|s_i - \tilde s(x_i)|} \]
 
-        with the trilinear weights $w_{ik}$ of the points $x_i$.
-
-        Args:
-            x: points, metres.
-            sdf: the field's signed distances there, metres.
+        with the trilinear weights $w_{ik}$ of the points $x_i$, of all processes.
         """
-        grid = self.grid
-        if grid is None or len(x) == 0:
+        if self._noted is None:
             return
-        pull, weight, mean = residuals(grid, x, sdf)
-        if mean is not None:
+        pull, weight, differences = (summed_over_processes(tensor) for tensor in self._noted)
+        total, count = differences.tolist()
+        if count:
             self.values += pull / weight.clamp_min(1e-6)
-            self.error += _RECENT * (_SPREAD * mean - self.error)
+            self.error += _RECENT * (_SPREAD * total / count - self.error)
+        for tensor in self._noted:
+            tensor.zero_()
 
     def take_on(self, state: dict[str, Tensor], prefix: str) -> None:
         """Puts what a run of an earlier version lacks into its state: a grid without values."""
@@ -96,27 +105,35 @@ class TrainingGrid(nn.Module):
 
 
 @torch.no_grad()
-def residuals(
-    grid: SdfGrid, x: Float[Tensor, "n 3"], sdf: Float[Tensor, "n"]
-) -> tuple[Float[Tensor, "X Y Z"], Float[Tensor, "X Y Z"], float | None]:
-    """Each node's sum of weights times residuals of the points around it, and of weights; the mean residual, absolute.
+def add_residuals(
+    grid: SdfGrid, x: Float[Tensor, "n 3"], sdf: Float[Tensor, "n"], noted: Residuals | None = None
+) -> Residuals:
+    """Adds up by how much a grid is wrong at points, for each node around them.
 
     Args:
         grid: of distances.
         x: points, metres; those where the grid is not known are left out.
         sdf: what the distances there should be, metres.
+        noted: what was added up before, which is changed; None begins anew.
+
+    Returns:
+        each node's sum of weights times residuals, and of weights; sum and number of the absolute residuals.
     """
-    pull, weight = torch.zeros_like(grid.values), torch.zeros_like(grid.values)
+    if noted is None:
+        one = torch.zeros_like(grid.values)
+        noted = one, one.clone(), torch.zeros(2, dtype=torch.float64, device=x.device)
+    pull, weight, differences = noted
     if not x.is_cuda and x.dtype == torch.float32:
         given = (t.contiguous().numpy() for t in (x, sdf.float()))
-        total, count = kernels.collect_residuals(*given, *grid.arrays()[:3], pull.numpy(), weight.numpy())
-        return pull, weight, total / count if count else None
+        found = kernels.collect_residuals(*given, *grid.arrays()[:3], pull.numpy(), weight.numpy())
+        differences += torch.tensor(found)
+        return noted
     middle, (index, weights) = grid.interpolate(x), grid.corners(x)
     known = (~middle.isnan()).nonzero()[:, 0]
-    if len(known) == 0:
-        return pull, weight, None
     residual = sdf.to(middle.dtype)[known] - middle[known]
     index, weights = index[known].flatten(), weights[known]
     pull.view(-1).index_add_(0, index, (weights * residual[:, None]).flatten())
     weight.view(-1).index_add_(0, index, weights.flatten())
-    return pull, weight, float(residual.abs().mean())
+    differences[0] += residual.abs().sum()
+    differences[1] += len(known)
+    return noted
