@@ -109,7 +109,8 @@ class Walk:
                 space, so less than one.
             finest: the steps of the samples found are divided until these are at most $2 \beta$ long, or this, metres;
                 0 leaves them.
-            grid: of the field's distances. Rays are followed by it, and the field is queried only where samples may count.
+            grid: of the field's distances. Rays are followed by it, and the field is queried only where samples may
+                count.
         """
         parts = parts_of_step(self.step, float(query.beta.detach()), finest)
         if grid is None:
