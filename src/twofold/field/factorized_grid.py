@@ -52,7 +52,7 @@ class GridFieldConfig:
     """Hidden units of the small networks."""
     shared: int = 16
     """Size of the features handed from one network to the next."""
-    pose_code: int = 8
+    pose_code: int = 2
     """The pose is squeezed to this many numbers before the pose-dependent branch sees it."""
     radius: float = 0.1
     """Features exist this far from the canonical body, metres; at least the shell's radius."""
