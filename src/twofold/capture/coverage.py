@@ -32,6 +32,10 @@ BEHIND = 0.015
 GRAZING, FACING = 0.15, 0.55
 """Cosines of the angle between normal and line of sight from which a vertex counts, and from which it counts fully: at
 81 degrees an error of pose moves the outline across it, at 57 degrees no more."""
+OUTLINE = 0.35
+"""Cosine of the angle between normal and line of sight up to which a vertex lies on the outline."""
+SOME = 1.0
+"""Images with which the place of a vertex on their outline is half known."""
 FINE = 20.0
 """Pixels a metre from which resolution is no limit: a hand is some pixels wide."""
 FEW = 0.25
@@ -52,6 +56,7 @@ class Coverage:
         weight: how well it was observed, 0 (never) to 1.
         area: of the surface around it in the canonical pose, square metres; 0 inside the mouth and the like.
         images: that were looked at.
+        outline: how well the place of the surface was observed, 0 to 1: on how many outlines the vertex lay.
     """
 
     count: Int[Tensor, "V"]
@@ -60,6 +65,7 @@ class Coverage:
     weight: Float[Tensor, "V"]
     area: Float[Tensor, "V"]
     images: int
+    outline: Float[Tensor, "V"]
 
     @property
     def share(self) -> float:
@@ -88,6 +94,8 @@ class Coverage:
         if not whole or not all(arrays[n].dtype.kind in "fiu" and are_moderate(arrays[n]) for n in (*names, "images")):
             raise TwofoldError(f"{where} does not hold the coverage of a body; it is damaged, train again.")
         tensors = {name: torch.as_tensor(arrays[name]).float() for name in names[1:]}
+        # Runs of earlier versions did not look at outlines.
+        tensors["outline"] = torch.as_tensor(arrays.get("outline", np.ones_like(arrays["weight"]))).float()
         return Coverage(torch.as_tensor(arrays["count"]).long(), **tensors, images=int(arrays["images"]))
 
 
@@ -156,7 +164,7 @@ def measure_coverage(capture: Capture, max_frames: int = MAX_FRAMES) -> Coverage
     shaped = shape_body(capture.body, capture.betas)
     frames = spread(capture.train, max_frames)
     zeros = torch.zeros(len(shaped.vertices))
-    count, cosines, resolutions, best, total = zeros.long(), zeros, zeros, zeros, zeros
+    count, cosines, resolutions, best, total, outlines = zeros.long(), zeros, zeros, zeros, zeros, zeros
     body = None
     for frame in frames:
         body = pose_body(shaped, frame.pose, frame.translation)
@@ -171,8 +179,9 @@ def measure_coverage(capture: Capture, max_frames: int = MAX_FRAMES) -> Coverage
         resolutions = torch.where(seen, torch.maximum(resolutions, resolution), resolutions)
         here = quality(seen, cosine, resolution)
         best, total = torch.maximum(best, here), total + here
+        outlines = outlines + (seen & (cosine < OUTLINE))
     area = outer_area(body) if body is not None else zeros
-    return Coverage(count, cosines, resolutions, combined(best, total), area, len(frames))
+    return Coverage(count, cosines, resolutions, combined(best, total), area, len(frames), outlines / (outlines + SOME))
 
 
 @torch.no_grad()

@@ -86,6 +86,7 @@ class Completion(nn.Module):
     """Coverage and targets of one person. All of it is part of the avatar's state, so a resumed run goes on alike."""
 
     weight: Tensor
+    placed: Tensor
     area: Tensor
     facing: Tensor
     target: Tensor
@@ -105,6 +106,7 @@ class Completion(nn.Module):
         self.config, self.shaped = config, shaped
         count = len(vertices)
         self.register_buffer("weight", torch.ones(count))
+        self.register_buffer("placed", torch.ones(count))
         self.register_buffer("area", torch.zeros(count))
         self.register_buffer("facing", torch.zeros(count))
         self.register_buffer("target", torch.zeros(config.samples, 3))
@@ -126,6 +128,10 @@ class Completion(nn.Module):
         """
         self.weight.copy_(coverage.weight if coverage.share < WELL_OBSERVED else torch.ones_like(self.weight))
         self.area.copy_(coverage.area)
+        placed = torch.minimum(coverage.outline, coverage.weight.clamp_min(0) * 0 + coverage.outline)
+        share = float(coverage.area[placed >= 0.5].sum() / coverage.area.sum())
+        print("outlined share", share)
+        self.placed.copy_(placed if share < WELL_OBSERVED else torch.ones_like(placed))
         self.facing.copy_(facing)
         self._forget()
 
@@ -151,7 +157,9 @@ class Completion(nn.Module):
             nearest = torch.from_numpy(fill.samples.nearest).to(self.vertices.device)
             normals = torch.nn.functional.normalize(at(self.normals), dim=-1)
             ends = (1 - at(self.weight).double() / ENOUGH).clamp_min(0).cumsum(0)
-            self._surface = _Surface(fill, at(self.vertices), normals, nearest, ends)
+            shape_ends = (1 - at(self.placed).double() / ENOUGH).clamp_min(0).cumsum(0)
+            shape_fill = SurfaceFill(self.shaped, self.placed.cpu().numpy(), area, facing, self.config.samples)
+            self._surface = _Surface(fill, at(self.vertices), normals, nearest, ends, shape_fill, shape_ends)
         return self._surface
 
     @property
@@ -184,7 +192,7 @@ class Completion(nn.Module):
         brightness = np.exp(slope * np.where(facing < 0, TURNED_AWAY * facing, facing))[:, None]
         found = torch.from_numpy(on.fill(lit / brightness) * brightness).to(self.target)
         self.target.copy_((found / light).clamp(0, 1))
-        away = torch.from_numpy(on.fill(offset[:, None].cpu().numpy(), SHAPE_RING))[:, 0]
+        away = torch.from_numpy(on.shape_fill(offset[:, None].cpu().numpy(), SHAPE_RING))[:, 0]
         self.offset.copy_(away.clamp(LOWEST, HIGHEST))
 
     @property
@@ -223,6 +231,13 @@ class Completion(nn.Module):
         answer = answers(x, on.nearest[index])
         found = (answer,) if answer.base is None else (answer, answer.base)
         color = share * torch.stack([(answer.color - self.target[index]).square().mean() for answer in found]).mean()
+        random = torch.rand(config.points, 2, generator=generator, device=generator.device).to(on.ends)
+        index = torch.searchsorted(on.shape_ends, random[:, 0] * on.shape_ends[-1]).clamp_max(len(on.ends) - 1)
+        away = (INSIDE + (OUTSIDE - INSIDE) * random[:, 1]).float()
+        x = on.points[index] + (self.offset[index] + away)[:, None] * on.normals[index]
+        answer = answers(x, on.nearest[index])
+        found = (answer,) if answer.base is None else (answer, answer.base)
+        share = float(((1 - self.placed.double() / ENOUGH).clamp_min(0) * self.area).sum() / self.area.sum().clamp_min(1e-12))
         shape = share * torch.stack([((answer.sdf - away) * 100).square().mean() for answer in found]).mean()
         terms = {"completion_color": config.color * color, "completion_shape": config.shape * shape}
         return {name: term for name, term in terms.items() if getattr(config, name.removeprefix("completion_"))}
@@ -239,3 +254,5 @@ class _Surface(NamedTuple):
     normals: Float[Tensor, "n 3"]
     nearest: Int[Tensor, "n"]
     ends: Float[Tensor, "n"]
+    shape_fill: SurfaceFill
+    shape_ends: Float[Tensor, "n"]
