@@ -85,6 +85,26 @@ def test_one_image_more_never_lowers_what_was_observed(person):
     assert (measure_coverage(person).weight >= measure_coverage(fewer).weight - 1e-6).all()
 
 
+def test_the_outline_is_where_the_surface_turns_away(person):
+    """Filmed from the front its sides are on outlines; with cameras from all sides nearly everything is."""
+    coverage = measure_coverage(person)
+    body = pose_body(shape_body(person.body, person.betas), person.train[0].pose, torch.zeros(3))
+    normals = trimesh.Trimesh(body.canonical_vertices.numpy(), body.faces.numpy(), process=False).vertex_normals
+    outer = coverage.area > 0
+    ahead, beside = (torch.from_numpy(normals[:, 2] > 0.9), torch.from_numpy(abs(normals[:, 2]) < 0.2))
+    assert (coverage.outline[ahead & outer] >= 0.5).float().mean() < 0.3
+    assert (coverage.outline[beside & outer] >= 0.5).float().mean() > 0.5
+    assert 0 < coverage.outlined_share < 0.9
+    both = dataclasses.replace(person, splits={"train": (*person.train, *person.splits["novel_view"])})
+    assert measure_coverage(both).outlined_share > coverage.outlined_share + 0.1
+
+
+def test_runs_of_before_knew_no_outlines(person):
+    arrays = coverage_of(person).arrays()
+    del arrays["outline"]
+    assert (Coverage.from_arrays(arrays, "here").outline == 1).all()
+
+
 def test_all_cameras_together_see_more(person):
     both = dataclasses.replace(person, splits={"train": (*person.train, *person.splits["novel_view"])})
     assert coverage_of(both).share > coverage_of(person).share

@@ -174,7 +174,11 @@ def test_dense_networks_are_pulled_to_the_targets_too(name, person, generator):
     sum(terms.values()).backward()
     assert any(p.grad is not None and p.grad.any() for p in avatar.field.parameters())
     ((x, vertex),) = answers
-    assert (completion.weight[vertex] < 1).all()
+    # First those of the colour, then those of the shape.
+    points = completion.config.points
+    assert (completion.weight[vertex[:points]] < 1).all()
+    assert (completion.placed[vertex[points:]] < 1).all()
+    assert (completion.weight[vertex[points:]] > 0.9).any()
     on = completion._on_surface()
     nearest = (x[:, None] - on.points).norm(dim=-1).argmin(1)
     along = ((x - on.points[nearest]) * on.normals[nearest]).sum(-1) - completion.offset[nearest]
@@ -202,7 +206,33 @@ def test_a_subject_that_is_nearly_all_observed_is_left_alone(person):
     coverage, completion = coverage_of(person), avatar.completion
     for share, left_alone in ((0.95, True), (0.8, False)):
         order = coverage.area.cumsum(0) / coverage.area.sum()
-        completion.prepare(replace(coverage, weight=(order <= share).float()), torch.zeros(len(order)))
+        known = (order <= share).float()
+        completion.prepare(replace(coverage, weight=known, outline=known), torch.zeros(len(order)))
         assert (completion.unobserved == 0) == left_alone
         assert bool((completion.weight == 1).all()) == left_alone
         assert completion.is_due(completion.config.start) != left_alone
+
+
+def test_the_shape_of_what_was_seen_from_the_front_only_is_completed_from_the_outlines(person):
+    """A front that bulges, as it may before one camera, where outlines say that the surface is 1 cm from the body."""
+    completion = prepared(person).completion
+    on = completion._on_surface()
+    placed = torch.from_numpy(on.shape_fill.weight)
+    on_outline = placed > 0
+    assert 0.1 < on_outline.float().mean() < 0.9
+    ahead = (placed == 0) & torch.from_numpy((on.fill.weight > 0.8) & np.isin(on.fill.group, (TRUNK, LEGS)))
+    assert ahead.sum() > 300
+
+    def answer(x, vertex):
+        away = ((x - on.points) * on.normals).sum(-1)
+        return FieldOutput(torch.where(on_outline, away - 0.01, away - 0.05), torch.full((len(x), 3), 0.5), None)
+
+    completion.refresh(answer, torch.ones(len(on.points), 3))
+    assert (completion.offset[ahead] - 0.01).abs().mean() < 0.004
+
+
+def test_runs_of_before_complete_the_shape_where_they_complete_the_colours(person):
+    completion = prepared(person).completion
+    state = {f"completion.{name}": tensor for name, tensor in completion.state_dict().items() if name != "placed"}
+    completion.take_on(state, "completion.")
+    assert torch.equal(state["completion.placed"], completion.weight)

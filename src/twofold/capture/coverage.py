@@ -72,6 +72,11 @@ class Coverage:
         """Share of the outer surface that was observed, 0..1."""
         return float(self.area[self.weight >= WELL].sum() / self.area.sum().clamp_min(1e-12))
 
+    @property
+    def outlined_share(self) -> float:
+        """Share of the outer surface that lay on outlines, 0..1."""
+        return float(self.area[self.outline >= WELL].sum() / self.area.sum().clamp_min(1e-12))
+
     def sentence(self) -> str:
         """For logs and reports."""
         return f"coverage: {100 * self.share:.0f} % of the surface"

@@ -126,12 +126,11 @@ class Completion(nn.Module):
             coverage: of the body's surface.
             facing: mean cosine between each vertex's normal and its direction to the training cameras.
         """
-        self.weight.copy_(coverage.weight if coverage.share < WELL_OBSERVED else torch.ones_like(self.weight))
+        well = coverage.share >= WELL_OBSERVED
+        self.weight.copy_(torch.ones_like(self.weight) if well else coverage.weight)
         self.area.copy_(coverage.area)
-        placed = torch.minimum(coverage.outline, coverage.weight.clamp_min(0) * 0 + coverage.outline)
-        share = float(coverage.area[placed >= 0.5].sum() / coverage.area.sum())
-        print("outlined share", share)
-        self.placed.copy_(placed if share < WELL_OBSERVED else torch.ones_like(placed))
+        well = coverage.outlined_share >= WELL_OBSERVED
+        self.placed.copy_(torch.ones_like(self.placed) if well else coverage.outline)
         self.facing.copy_(facing)
         self._forget()
 
@@ -141,6 +140,8 @@ class Completion(nn.Module):
             state |= {
                 f"{prefix}{name}": torch.zeros_like(getattr(self, name)) for name in ("facing", "target", "offset")
             }
+        # Its shape was completed where its colours were.
+        state.setdefault(f"{prefix}placed", state.get(f"{prefix}weight", self.placed))
 
     def _forget(self) -> None:
         self._surface = None
@@ -148,17 +149,19 @@ class Completion(nn.Module):
     def _on_surface(self) -> "_Surface":
         """What follows from coverage alone."""
         if self._surface is None:
-            weight, area, facing = (values.cpu().numpy() for values in (self.weight, self.area, self.facing))
-            fill = SurfaceFill(self.shaped, weight, area, facing, self.config.samples)
+            weight, placed, area, facing = (
+                values.cpu().numpy() for values in (self.weight, self.placed, self.area, self.facing)
+            )
+            fill, shape_fill = (
+                SurfaceFill(self.shaped, known, area, facing, self.config.samples) for known in (weight, placed)
+            )
 
             def at(values: Tensor) -> Tensor:
                 return torch.from_numpy(fill.samples.at(values.cpu().numpy()).astype(np.float32)).to(values)
 
             nearest = torch.from_numpy(fill.samples.nearest).to(self.vertices.device)
             normals = torch.nn.functional.normalize(at(self.normals), dim=-1)
-            ends = (1 - at(self.weight).double() / ENOUGH).clamp_min(0).cumsum(0)
-            shape_ends = (1 - at(self.placed).double() / ENOUGH).clamp_min(0).cumsum(0)
-            shape_fill = SurfaceFill(self.shaped, self.placed.cpu().numpy(), area, facing, self.config.samples)
+            ends, shape_ends = (_lacking(at(known)).cumsum(0) for known in (self.weight, self.placed))
             self._surface = _Surface(fill, at(self.vertices), normals, nearest, ends, shape_fill, shape_ends)
         return self._surface
 
@@ -198,14 +201,21 @@ class Completion(nn.Module):
     @property
     def unobserved(self) -> float:
         """Share of the surface that was not observed, each point counted by how badly it was."""
-        unseen = (1 - self.weight.double() / ENOUGH).clamp_min(0) * self.area
-        return float(unseen.sum() / self.area.sum().clamp_min(1e-12))
+        return self._share(self.weight)
+
+    @property
+    def unplaced(self) -> float:
+        """Share of the surface that lay on no outline, likewise."""
+        return self._share(self.placed)
+
+    def _share(self, known: Float[Tensor, "V"]) -> float:
+        return float((_lacking(known) * self.area).sum() / self.area.double().sum().clamp_min(1e-12))
 
     def is_due(self, step: int) -> bool:
         """Whether the targets are to be taken anew at a step."""
         start, every = self.config.start, self.config.every
         first = step == start or (step > start and not self.target.any())
-        return self.unobserved > 1e-3 and (first or (step > start and step % every == 0))
+        return max(self.unobserved, self.unplaced) > 1e-3 and (first or (step > start and step % every == 0))
 
     def terms(self, answers: Answers, step: int, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         r"""The weighted loss terms of a step.
@@ -213,40 +223,52 @@ class Completion(nn.Module):
         At points $p$ of the body drawn with probability proportional to their unobserved area, and points
         $x = p + (t_p + \epsilon) n_p$ about the completed surface, with the share $u$ of the area that is unobserved,
 
-        \[ L_{color} = u \, E \lVert c(x) - \hat c_p \rVert^2, \qquad L_{shape} = u \, E (s(x) - \epsilon)^2 \]
+        \[ L_{color} = u \, E \lVert c(x) - \hat c_p \rVert^2, \qquad L_{shape} = u' \, E (s(x') - \epsilon)^2 \]
+
+        The colour of a point is observed where an image shows it, its place where it lies on the outline of one: from
+        the front a leg looks alike whatever its depth. So the second term has points $x'$ and a share $u'$ of its own.
 
         Args:
             answers: the field.
             step: of the training.
             generator: draws the points.
         """
-        config, share = self.config, self.unobserved
-        if step < config.start or share < 1e-3:
+        config = self.config
+        color, shape = config.color * self.unobserved, config.shape * self.unplaced
+        if step < config.start or max(color, shape) < 1e-6:
             return {}
         on = self._on_surface()
-        random = torch.rand(config.points, 2, generator=generator, device=generator.device).to(on.ends)
-        index = torch.searchsorted(on.ends, random[:, 0] * on.ends[-1]).clamp_max(len(on.ends) - 1)
-        away = (INSIDE + (OUTSIDE - INSIDE) * random[:, 1]).float()
+        drawn = [
+            self._draw(ends, generator) for ends, weight in ((on.ends, color), (on.shape_ends, shape)) if weight > 0
+        ]
+        index, away = (torch.cat(parts) for parts in zip(*drawn, strict=True))
         x = on.points[index] + (self.offset[index] + away)[:, None] * on.normals[index]
         answer = answers(x, on.nearest[index])
-        found = (answer,) if answer.base is None else (answer, answer.base)
-        color = share * torch.stack([(answer.color - self.target[index]).square().mean() for answer in found]).mean()
-        random = torch.rand(config.points, 2, generator=generator, device=generator.device).to(on.ends)
-        index = torch.searchsorted(on.shape_ends, random[:, 0] * on.shape_ends[-1]).clamp_max(len(on.ends) - 1)
-        away = (INSIDE + (OUTSIDE - INSIDE) * random[:, 1]).float()
-        x = on.points[index] + (self.offset[index] + away)[:, None] * on.normals[index]
-        answer = answers(x, on.nearest[index])
-        found = (answer,) if answer.base is None else (answer, answer.base)
-        share = float(((1 - self.placed.double() / ENOUGH).clamp_min(0) * self.area).sum() / self.area.sum().clamp_min(1e-12))
-        shape = share * torch.stack([((answer.sdf - away) * 100).square().mean() for answer in found]).mean()
-        terms = {"completion_color": config.color * color, "completion_shape": config.shape * shape}
-        return {name: term for name, term in terms.items() if getattr(config, name.removeprefix("completion_"))}
+        found, terms = (answer,) if answer.base is None else (answer, answer.base), {}
+        if color > 0:
+            first = slice(0, config.points)
+            off = torch.stack([(f.color[first] - self.target[index[first]]).square().mean() for f in found])
+            terms["completion_color"] = color * off.mean()
+        if shape > 0:
+            last = slice(-config.points, None)
+            off = torch.stack([((f.sdf[last] - away[last]) * 100).square().mean() for f in found])
+            terms["completion_shape"] = shape * off.mean()
+        return terms
+
+    def _draw(
+        self, ends: Float[Tensor, "n"], generator: torch.Generator
+    ) -> tuple[Int[Tensor, "points"], Float[Tensor, "points"]]:
+        """Points of the surface, drawn by how badly they are known, and how far from it samples are taken, metres."""
+        random = torch.rand(self.config.points, 2, generator=generator, device=generator.device).to(ends)
+        index = torch.searchsorted(ends, random[:, 0] * ends[-1]).clamp_max(len(ends) - 1)
+        return index, (INSIDE + (OUTSIDE - INSIDE) * random[:, 1]).float()
 
 
 class _Surface(NamedTuple):
     """Points of the canonical body with what follows from coverage.
 
-    `nearest` are vertices beside the points, `ends` running sums of how badly they were observed.
+    `nearest` are vertices beside the points; `ends` and `shape_ends` running sums of how badly their colour and their
+    place were observed; `fill` and `shape_fill` complete the one and the other.
     """
 
     fill: SurfaceFill
@@ -256,3 +278,8 @@ class _Surface(NamedTuple):
     ends: Float[Tensor, "n"]
     shape_fill: SurfaceFill
     shape_ends: Float[Tensor, "n"]
+
+
+def _lacking(known: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """How badly points are known, 0..1, by how well they are."""
+    return (1 - known.double() / ENOUGH).clamp_min(0)
