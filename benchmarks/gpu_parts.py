@@ -218,7 +218,8 @@ def tests(task: Task) -> dict[str, object]:
     counts = {key: int(suite.get(key, "0")) for key in ("tests", "failures", "errors", "skipped")}
     broken = [f"{case.get('classname')}.{case.get('name')}" for case in suite if len(case) and case[0].tag != "skipped"]
     wrong = broken or not counts["tests"]
-    return {**counts, "broken": broken} | ({"failed": f"{len(broken)} of {counts['tests']} tests"} if wrong else {})
+    found: dict[str, object] = {**counts, "broken": broken}
+    return found | ({"failed": f"{len(broken)} of {counts['tests']} tests"} if wrong else {})
 
 
 PARTS: dict[str, Callable[[Task], dict[str, object]]] = {

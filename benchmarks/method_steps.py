@@ -143,7 +143,7 @@ def main() -> None:
         result["methods"][name] = {"trained_steps": steps, "dense": dense, "fast": fast, "times_faster": ratio}
         print(f"{name}: dense {dense['mean_s']:.2f} s, fast {fast['mean_s']:.3f} s, {ratio:.1f} times", flush=True)
     if "humannerf" in arguments.methods:
-        result["weight_volume"] = weight_volume(capture)
+        result["weight_volume"] = weight_volume(studio_capture(192))
     store(NAME, result)
 
 
