@@ -8,6 +8,7 @@ from small_recipes import CASES
 from twofold.geometry.cameras import pixel_grid, pixel_rays
 from twofold.methods.base import Mode
 from twofold.methods.subject import Subject
+from twofold.sampling import training_grid
 from twofold.sampling.training_grid import TrainingGrid, add_residuals
 
 POINTS = torch.from_numpy(ball()[0])
@@ -87,6 +88,15 @@ def test_points_beyond_the_grid_change_nothing(grid):
     grid.settle()
     assert torch.equal(grid.values, before[0])
     assert torch.equal(grid.error, before[1])
+
+
+def test_a_process_whose_rays_all_miss_takes_part_in_the_sums_of_the_others(grid, monkeypatch):
+    summed = []
+    monkeypatch.setattr(training_grid, "summed_over_processes", lambda tensor: summed.append(tensor.shape) or tensor)
+    before = grid.values.clone()
+    grid.settle()
+    assert summed == [grid.values.shape, grid.values.shape, (2,)]
+    assert torch.equal(grid.values, before)
 
 
 def test_it_is_queried_more_often_at_the_beginning(grid):

@@ -17,10 +17,10 @@ _SPREAD = 3.0
 
 Samples that just count lie one or two centimetres from the surface, so a difference beyond the error costs light that
 hardly anybody sees; and what the grid finds is shown to the field itself before it is shaded."""
-Residuals = tuple[Tensor, Tensor, Tensor]
-"""See `add_residuals`."""
 _RECENT = 0.1
 """Weight of the newest step in the mean difference."""
+Residuals = tuple[Tensor, Tensor, Tensor]
+"""See `add_residuals`."""
 
 
 class TrainingGrid(nn.Module):
@@ -88,10 +88,13 @@ class TrainingGrid(nn.Module):
 
         with the trilinear weights $w_{ik}$ of the points $x_i$, of all processes.
         """
-        if self._noted is None:
+        grid = self.grid
+        if grid is None:
             return
-        pull, weight, differences = (summed_over_processes(tensor) for tensor in self._noted)
-        total, count = differences.tolist()
+        # Also where this process has nothing to add: the others wait for it.
+        self._noted = self._noted or _nothing(grid)
+        pull, weight, sums = (summed_over_processes(tensor) for tensor in self._noted)
+        total, count = sums.tolist()
         if count:
             self.values += pull / weight.clamp_min(1e-6)
             self.error += _RECENT * (_SPREAD * total / count - self.error)
@@ -119,14 +122,11 @@ def add_residuals(
     Returns:
         each node's sum of weights times residuals, and of weights; sum and number of the absolute residuals.
     """
-    if noted is None:
-        one = torch.zeros_like(grid.values)
-        noted = one, one.clone(), torch.zeros(2, dtype=torch.float64, device=x.device)
-    pull, weight, differences = noted
+    pull, weight, sums = noted = noted or _nothing(grid)
     if not x.is_cuda and x.dtype == torch.float32:
         given = (t.contiguous().numpy() for t in (x, sdf.float()))
         found = kernels.collect_residuals(*given, *grid.arrays()[:3], pull.numpy(), weight.numpy())
-        differences += torch.tensor(found)
+        sums += torch.tensor(found)
         return noted
     middle, (index, weights) = grid.interpolate(x), grid.corners(x)
     known = (~middle.isnan()).nonzero()[:, 0]
@@ -134,6 +134,12 @@ def add_residuals(
     index, weights = index[known].flatten(), weights[known]
     pull.view(-1).index_add_(0, index, (weights * residual[:, None]).flatten())
     weight.view(-1).index_add_(0, index, weights.flatten())
-    differences[0] += residual.abs().sum()
-    differences[1] += len(known)
+    sums[0] += residual.abs().sum()
+    sums[1] += len(known)
     return noted
+
+
+def _nothing(grid: SdfGrid) -> Residuals:
+    """Sums of no residuals."""
+    one = torch.zeros_like(grid.values)
+    return one, one.clone(), torch.zeros(2, dtype=torch.float64, device=one.device)
