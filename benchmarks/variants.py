@@ -70,7 +70,8 @@ def main() -> None:
     for name, subjects in rows.items():
         mean = {s: np.mean([f[s]["psnr_box"] for f in subjects.values()]) for s in ("novel_view", "novel_pose")}  # type: ignore[index]
         print(name, *(f"{split} {value:.2f}" for split, value in mean.items()))
-    store("variants", {"images": IMAGES, "steps": variant("full").training.steps, "rows": rows})
+    steps = variant("full").training.steps
+    store("variants", {"images": IMAGES, "steps": steps, "against": arguments.variants[0], "rows": rows})
 
 
 if __name__ == "__main__":

@@ -1,0 +1,35 @@
+"""The part of the results page about variants of `quick`."""
+
+from collections.abc import Callable, Mapping, Sequence
+from statistics import mean, stdev
+from typing import Any
+
+Table = Callable[[Sequence[str], Sequence[Sequence[str]]], str]
+SPLITS = {"novel_view": "novel view", "novel_pose": "novel pose"}
+
+
+def section(result: Mapping[str, Any], table: Table) -> str:
+    """Box PSNR of each variant, and by how much it is better than the one that all are compared with."""
+    against = result["rows"][result["against"]]
+    rows = []
+    for name, subjects in result["rows"].items():
+        means, gains = [], []
+        for split in SPLITS:
+            own = {subject: found[split]["psnr_box"] for subject, found in subjects.items()}
+            means.append(f"{mean(own.values()):.2f}")
+            differences = [value - against[subject][split]["psnr_box"] for subject, value in own.items()]
+            won = sum(difference > 0 for difference in differences)
+            gains.append(
+                f"{mean(differences):+.2f} ± {stdev(differences):.2f}, {won} of {len(differences)}"
+                if name != result["against"]
+                else ""
+            )
+        rows.append((f"`{name}`", str(len(subjects)), *means, *gains))
+    text = (
+        f"Subjects that no other table reports, one training each: {result['steps']} steps, {result['images']} images "
+        f"of each split, PSNR over the box, dB. Then the difference to `{result['against']}` on the same subjects: "
+        "mean ± standard deviation, subjects that gain. With fewer numbers of the pose the fine networks overfit less; "
+        "2 became the default. `python -m benchmarks.variants`."
+    )
+    head = ("Variant", "Subjects", *SPLITS.values(), *(f"{name}, gain" for name in SPLITS.values()))
+    return f"## Numbers of the pose\n\n{text}\n\n" + table(head, rows)
