@@ -231,8 +231,8 @@ def _camera_colors(result: dict[str, Any]) -> str:
     ]
     text = (
         f"A synthetic subject before four training cameras, {result['size']} x {result['size']}, {result['steps']} "
-        "steps, measured by the four cameras between them. Where one camera's images are darker by 15 % and tinted, learned "
-        "gains and offsets bring back about half of what that costs; where none is, they cost a little. "
+        "steps, measured by the four cameras between them. Where one camera's images are darker by 15 % and tinted, "
+        "learned gains and offsets bring back about half of what that costs; where none is, they cost a little. "
         "`python -m benchmarks.camera_colors`."
     )
     return f"## Colours of several cameras\n\n{text}\n\n" + _table(
