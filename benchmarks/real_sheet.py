@@ -46,6 +46,8 @@ def around(avatar: Avatar, capture: Capture, posed: PosedAvatar, views: int) -> 
     images = [as_bytes(render_image(avatar, posed, c, background).color) for c in orbit(posed, EDGE, views)]
     # Cut to what is not background in any of them.
     person = np.any([np.abs(i.astype(int) - as_bytes(background[None, None])).max(-1) > 12 for i in images], 0)
+    if not person.any():
+        raise SystemExit(f"the avatar is invisible in views of {EDGE} x {EDGE} from all sides; train it further")
     rows, columns = (np.flatnonzero(person.any(axis)) for axis in (1, 0))
     part = slice(max(rows[0] - 4, 0), rows[-1] + 5), slice(max(columns[0] - 4, 0), columns[-1] + 5)
     return [image[part] for image in images]
@@ -83,6 +85,8 @@ def main() -> None:
     middle = capture.train[len(capture.train) // 2]
     rows.append(around(avatar, capture, pose_at(avatar, capture, middle), arguments.views))
     motion = as_single(BUILTIN_MOTIONS["dance"](shape_body(capture.body, capture.betas)))
+    if not 0 <= arguments.frame < len(motion):
+        raise SystemExit(f"--frame should be 0 to {len(motion) - 1}, of the dance; it is {arguments.frame}")
     dancing = avatar.pose(motion.poses[arguments.frame], motion.translations[arguments.frame])
     rows.append(around(avatar, capture, dancing, arguments.views))
     strips = [[strip(row, arguments.height)] for row in rows]

@@ -2,7 +2,7 @@
 
 python -m benchmarks.variants full pose_lf wo_feat method.pose.drop=0.5 method.field.pose_code=4 [--seeds 11 12]
 
-A variant is "full", an ablation, or a setting (several joined by "+"). Each is trained like a cell of
+A variant is "full", an ablation, a setting, or several of these joined by "+". Each is trained like a cell of
 `twofold reproduce --data studio`: 40 images of 192 x 192 of one camera, 900 steps.
 """
 
@@ -34,10 +34,10 @@ METRICS = ("psnr_box", "ssim_box", "gradient_error")
 
 def variant(name: str) -> Recipe:
     """The recipe of a variant."""
-    full = base_recipe("quick", synthetic=True)
-    if name == "full":
-        return full
-    return ablation(name, full) if name in ABLATIONS else with_settings(full, name.split("+"))
+    recipe, parts = base_recipe("quick", synthetic=True), name.split("+")
+    for part in parts:
+        recipe = ablation(part, recipe) if part in ABLATIONS else recipe
+    return with_settings(recipe, [part for part in parts if part not in (*ABLATIONS, "full")])
 
 
 def measured(avatar: Avatar, capture: Capture) -> dict[str, dict[str, float]]:

@@ -151,6 +151,8 @@ def test_coverage_is_stored_and_damage_is_named(person):
         {**coverage.arrays(), "weight": np.zeros(3)},
         {k: v for k, v in coverage.arrays().items() if k != "area"},
         {**coverage.arrays(), "cosine": np.full(len(coverage.weight), np.nan)},
+        {**coverage.arrays(), "outline": np.full(len(coverage.weight), np.nan)},
+        {**coverage.arrays(), "outline": np.ones(3)},
     ):
         with pytest.raises(TwofoldError, match="here does not hold the coverage"):
             Coverage.from_arrays(broken, "here")

@@ -231,6 +231,34 @@ def test_the_shape_of_what_was_seen_from_the_front_only_is_completed_from_the_ou
     assert (completion.offset[ahead] - 0.01).abs().mean() < 0.004
 
 
+def test_shape_is_completed_where_all_colours_were_observed_but_outlines_lack(person, generator):
+    avatar = completing_recipe(1).method.build(Subject.of(person))
+    coverage, completion = coverage_of(person), avatar.completion
+    ones = torch.ones_like(coverage.weight)
+    completion.prepare(replace(coverage, weight=ones), torch.zeros_like(ones))
+    assert completion.unobserved == 0
+    assert completion.unplaced > 0.1
+    assert completion.is_due(completion.config.start)
+    posed = avatar.pose(person.train[0].pose, person.train[0].translation)
+    terms = completion.terms(lambda x, v: avatar.answer_beside(x, v, posed), 1000, generator)
+    assert set(terms) == {"completion_shape"}
+
+
+def test_a_share_too_small_for_targets_has_no_terms(person, generator):
+    """Else the field would be pulled to targets that were never taken."""
+    avatar = completing_recipe(1).method.build(Subject.of(person))
+    completion = avatar.completion
+    completion.prepare(coverage_of(person), torch.zeros(len(completion.weight)))
+    for known in (completion.weight, completion.placed):
+        known.fill_(1)
+        # The vertex with the largest area below a thousandth of the whole.
+        part = completion.area / completion.area.sum()
+        known[torch.where(part < 9e-4, part, 0).argmax()] = 0
+    assert 0 < completion.unobserved < 1e-3
+    assert not completion.is_due(completion.config.start)
+    assert completion.terms(lambda x, v: pytest.fail("queried"), 1000, generator) == {}
+
+
 def test_runs_of_before_complete_the_shape_where_they_complete_the_colours(person):
     completion = prepared(person).completion
     state = {f"completion.{name}": tensor for name, tensor in completion.state_dict().items() if name != "placed"}

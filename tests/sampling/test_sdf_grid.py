@@ -5,6 +5,7 @@ import torch
 from little_body import ball
 
 from twofold.sampling.sdf_grid import KNOWN_BELOW, UNKNOWN, SdfGrid, grid_nodes, tabulate
+from twofold.sampling.training_grid import add_residuals
 
 POINTS = torch.from_numpy(ball()[0])
 CENTER, RADIUS = POINTS.mean(0), float((POINTS - POINTS.mean(0)).norm(dim=1).mean())
@@ -76,5 +77,11 @@ def test_beside_a_node_that_is_not_known_nothing_is():
     values = torch.zeros(3, 3, 3)
     values[2, 2, 2] = UNKNOWN
     grid = SdfGrid(values, torch.zeros(3), 1.0, 0.0)
-    x = torch.tensor([[1.5, 1.5, 1.5], [0.5, 0.5, 0.5], [-0.1, 0.5, 0.5], [1.9, 1.2, 2.1]])
-    assert grid.interpolate(x).isnan().tolist() == [True, False, True, True]
+    x = torch.tensor(
+        [[1.5, 1.5, 1.5], [1.02, 1.02, 1.02], [0.5, 0.5, 0.5], [-0.1, 0.5, 0.5], [1.9, 1.2, 2.1], [torch.nan, 1.0, 1.0]]
+    )
+    unknown = [True, True, False, True, True, True]
+    assert grid.interpolate(x).isnan().tolist() == unknown
+    # The compiled loop and its twin: one of the points is known, and off by 1 m.
+    for points in (x, x.double()):
+        assert add_residuals(grid, points, torch.ones(len(x)))[2].tolist() == [1.0, 1.0]

@@ -202,7 +202,8 @@ def test_a_grid_that_knows_nothing_leaves_everything_to_the_field(started):
     empty = SdfGrid(torch.full((4, 4, 4), UNKNOWN), torch.zeros(3), 0.02, 0.0)
     with torch.no_grad():
         every, found = (walk.seen(FieldQuery(BallField(avatar), beta), 2e-3, 0.0, 0.0, g) for g in (None, empty))
-    assert set(by_place(found)) ^ set(by_place(every)) <= set()
+    assert len(every.samples) > 1000
+    assert set(by_place(found)) == set(by_place(every))
 
 
 def test_bounds_of_a_grid_decide_like_possible_samples(started, generator):
@@ -219,7 +220,7 @@ def test_bounds_of_a_grid_decide_like_possible_samples(started, generator):
     possible = np.empty(len(number), bool)
     own = np.float32(beta), np.float32(2e-3), np.float32(walk.step)
     search_kernels.mark_possible(number, ray_at, whole.x_canonical.numpy(), grid.arrays(), *own, possible)
-    # What is not known lets no light through here, and all of it there.
+    # Where nothing is known a sample counts here, and there only as far as its step is long.
     assert (possible != wanted.numpy()).mean() < 0.002
     assert 0.02 < possible.mean() < 0.98
 

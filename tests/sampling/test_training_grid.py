@@ -35,7 +35,7 @@ def grid():
 def test_before_the_first_query_there_is_no_grid():
     grid = TrainingGrid(POINTS, 0.02, 0.06)
     assert grid.grid is None
-    grid.learn(POINTS, torch.zeros(len(POINTS)))
+    grid.record(POINTS, torch.zeros(len(POINTS)))
     assert grid.grid is None
 
 
@@ -52,7 +52,7 @@ def test_it_follows_a_field_that_moves(grid, generator):
     errors = []
     for step in range(60):
         x = near(400, generator)
-        grid.learn(x, sphere(x, grown=0.01 * min(step / 30, 1)))
+        grid.record(x, sphere(x, grown=0.01 * min(step / 30, 1)))
         grid.settle()
         errors.append(grid.grid.error)
     x = near(2000, generator)
@@ -61,10 +61,10 @@ def test_it_follows_a_field_that_moves(grid, generator):
     assert errors[-1] < max(errors)
 
 
-def test_a_distance_that_is_watched_teaches_it(grid):
+def test_a_recorded_distance_corrects_it(grid):
     x = POINTS[:50] + 0.003
-    watched = grid.watching(lambda x: sphere(x, grown=0.005))
-    torch.testing.assert_close(watched(x), sphere(x, grown=0.005))
+    recorded = grid.recording(lambda x: sphere(x, grown=0.005))
+    torch.testing.assert_close(recorded(x), sphere(x, grown=0.005))
     grid.settle()
     assert (grid.grid.interpolate(x) - sphere(x, grown=0.005)).abs().mean() < 0.003
 
@@ -82,9 +82,18 @@ def test_residuals_are_those_of_the_twin_in_torch(grid, generator):
         torch.testing.assert_close(one, 2 * other)
 
 
+def test_it_follows_a_field_of_double_precision():
+    grid = TrainingGrid(POINTS, 0.02, 0.06).double()
+    grid.refresh(sphere)
+    x = POINTS[:50].double() + 0.003
+    grid.record(x, sphere(x, grown=0.005))
+    grid.settle()
+    assert (grid.grid.interpolate(x) - sphere(x, grown=0.005)).abs().mean() < 0.003
+
+
 def test_points_beyond_the_grid_change_nothing(grid):
     before = grid.values.clone(), grid.error.clone()
-    grid.learn(torch.full((3, 3), 9.0), torch.zeros(3))
+    grid.record(torch.full((3, 3), 9.0), torch.zeros(3))
     grid.settle()
     assert torch.equal(grid.values, before[0])
     assert torch.equal(grid.error, before[1])
@@ -122,7 +131,7 @@ def test_its_state_is_that_of_the_avatar_and_old_states_begin_without(person):
 def test_evaluation_does_not_use_it(person, monkeypatch):
     avatar = CASES["quick"].method.build(Subject.of(person))
     avatar.before_step(Mode(0))
-    monkeypatch.setattr(avatar.search, "watching", lambda distance: pytest.fail("asked"))
+    monkeypatch.setattr(avatar.search, "recording", lambda distance: pytest.fail("asked"))
     frame = person.train[0]
     rays = pixel_rays(frame.camera, pixel_grid(frame.camera).flatten(0, 1)[:50])
     with torch.no_grad():

@@ -20,6 +20,7 @@ from twofold.capture.coverage import coverage_of
 from twofold.capture.types import Capture
 from twofold.errors import TwofoldError
 from twofold.recipe import Recipe
+from twofold.training import loop
 from twofold.training.loop import COMPILED, NOTHING_COMPILED, Progress, train
 from twofold.training.run import read_checkpoint
 
@@ -228,17 +229,21 @@ def test_compiled_networks_learn_what_plain_ones_do(person: Capture, tmp_path: P
     assert_same(plain, compiled, 1e-4)
 
 
-@pytest.mark.parametrize(("case", "threads"), [("quick", 1), ("fast", 2)])
-def test_only_the_small_operations_of_feature_grids_take_one_thread_each(
-    person: Capture, tmp_path: Path, case: str, threads: int
+@pytest.mark.parametrize(("case", "rays", "threads"), [("quick", 40, 1), ("quick", 9000, 2), ("fast", 40, 2)])
+def test_only_small_steps_of_feature_grids_take_one_thread_for_each_operation(
+    person: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str, rays: int, threads: int
 ) -> None:
-    before, found = torch.get_num_threads(), []
+    before, within, after = torch.get_num_threads(), [], []
+    start = CASES[case].training
+    pixels = replace(start.pixels, rays=rays, patches=0)
+    recipe = replace(CASES[case], training=replace(start, steps=1, preview_every=0, images_per_step=1, pixels=pixels))
+    make_step = loop._Run.advance
+    monkeypatch.setattr(loop._Run, "advance", lambda run: within.append(torch.get_num_threads()) or make_step(run))
     torch.set_num_threads(2)
     try:
-        recipe = replace(CASES[case], training=replace(CASES[case].training, steps=1, preview_every=0))
-        train(person, recipe, tmp_path / "run", CPU, progress=lambda _: found.append(torch.get_num_threads()))
-        assert found == [threads]
-        assert torch.get_num_threads() == 2
+        train(person, recipe, tmp_path / "run", CPU, progress=lambda _: after.append(torch.get_num_threads()))
+        assert within == [threads]
+        assert after == [2]
     finally:
         torch.set_num_threads(before)
 

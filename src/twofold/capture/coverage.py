@@ -34,8 +34,8 @@ GRAZING, FACING = 0.15, 0.55
 81 degrees an error of pose moves the outline across it, at 57 degrees no more."""
 OUTLINE = 0.35
 """Cosine of the angle between normal and line of sight up to which a vertex lies on the outline."""
-SOME = 1.0
-"""Images with which the place of a vertex on their outline is half known."""
+OUTLINE_HALF = 1.0
+"""Images on whose outline a vertex lies with which its place is half known."""
 FINE = 20.0
 """Pixels a metre from which resolution is no limit: a hand is some pixels wide."""
 FEW = 0.25
@@ -56,7 +56,8 @@ class Coverage:
         weight: how well it was observed, 0 (never) to 1.
         area: of the surface around it in the canonical pose, square metres; 0 inside the mouth and the like.
         images: that were looked at.
-        outline: how well the place of the surface was observed, 0 to 1: on how many outlines the vertex lay.
+        outline: how well the place of the surface was observed, 0 to 1: m / (m + 1) with the number m of images on
+            whose outline the vertex lay.
     """
 
     count: Int[Tensor, "V"]
@@ -93,14 +94,15 @@ class Coverage:
         Raises:
             TwofoldError: something is missing, has the wrong shape or is not finite.
         """
-        names = ("count", "cosine", "resolution", "weight", "area")
+        names = ("count", "cosine", "resolution", "weight", "area", "outline")
+        if "weight" in arrays:
+            # Runs of earlier versions did not look at outlines.
+            arrays = {"outline": np.ones_like(arrays["weight"]), **arrays}
         sizes = {arrays[name].shape for name in names if name in arrays}
         whole = all(name in arrays for name in (*names, "images")) and len(sizes) == 1 and len(*sizes) == 1
         if not whole or not all(arrays[n].dtype.kind in "fiu" and are_moderate(arrays[n]) for n in (*names, "images")):
             raise TwofoldError(f"{where} does not hold the coverage of a body; it is damaged, train again.")
         tensors = {name: torch.as_tensor(arrays[name]).float() for name in names[1:]}
-        # Runs of earlier versions did not look at outlines.
-        tensors["outline"] = torch.as_tensor(arrays.get("outline", np.ones_like(arrays["weight"]))).float()
         return Coverage(torch.as_tensor(arrays["count"]).long(), **tensors, images=int(arrays["images"]))
 
 
@@ -186,7 +188,9 @@ def measure_coverage(capture: Capture, max_frames: int = MAX_FRAMES) -> Coverage
         best, total = torch.maximum(best, here), total + here
         outlines = outlines + (seen & (cosine < OUTLINE))
     area = outer_area(body) if body is not None else zeros
-    return Coverage(count, cosines, resolutions, combined(best, total), area, len(frames), outlines / (outlines + SOME))
+    return Coverage(
+        count, cosines, resolutions, combined(best, total), area, len(frames), outlines / (outlines + OUTLINE_HALF)
+    )
 
 
 @torch.no_grad()

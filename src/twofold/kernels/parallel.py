@@ -137,13 +137,6 @@ def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) 
     return list(_pool(threads).map(work, bounds[:-1], bounds[1:]))
 
 
-def summed_over_processes(values: torch.Tensor) -> torch.Tensor:
-    """The sum over the processes that train together, the same in each of them; of one process its own values."""
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
-        torch.distributed.all_reduce(values)
-    return values
-
-
 def ahead(items: Iterable[Item]) -> Generator[Item]:
     """The items in order; while one is used, the next is made in another thread.
 

@@ -303,9 +303,8 @@ class Avatar(nn.Module, ABC, Generic[Own]):
 
     # ---- training
 
-    @property
-    def one_thread_each(self) -> bool:
-        """Whether PyTorch's operations are too small to be shared out; the method's compiled loops still are."""
+    def one_thread_each(self, rays: int) -> bool:
+        """Whether PyTorch should use one thread per operation in steps of that many rays; compiled loops use all."""
         return False
 
     def stages(self, training: TrainingConfig) -> tuple[Stage, ...]:

@@ -28,7 +28,9 @@ LOWEST, HIGHEST = -0.04, 0.09
 ENOUGH = 0.7
 """Weight from which a vertex is left alone."""
 WELL_OBSERVED = 0.9
-"""Share of the surface from which on nothing is completed."""
+"""Share of the surface from which on nothing is completed: of what images show for colours, of outlines for shape."""
+LEAST_SHARE = 1e-3
+"""Share of the surface below which completing it is not worth a term."""
 NEWTON = 3
 """Steps along the normal from the body to the surface."""
 SHAPE_RING = 0.02
@@ -117,8 +119,9 @@ class Completion(nn.Module):
         self.register_load_state_dict_post_hook(lambda own, _: own._forget())
 
     def prepare(self, coverage: Coverage, facing: Float[Tensor, "V"]) -> None:
-        """Takes on what the training images show; where they show nearly all, nothing is completed.
+        """Takes on what the training images show.
 
+        Where they show nearly all, no colours are completed; where nearly all of the surface lay on outlines, no shape.
         Between fingers and under arms something always stays unobserved. On a subject that turns fully (97 % observed)
         completing it cost 0.1 dB in novel views, 0.3 dB in novel poses and 0.03 cm of the surface.
 
@@ -211,11 +214,16 @@ class Completion(nn.Module):
     def _share(self, known: Float[Tensor, "V"]) -> float:
         return float((_lacking(known) * self.area).sum() / self.area.double().sum().clamp_min(1e-12))
 
+    def _weights(self) -> tuple[float, float]:
+        """Weights of the terms of colour and shape: the settings times shares of the surface, tiny ones left out."""
+        color, shape = (share if share > LEAST_SHARE else 0.0 for share in (self.unobserved, self.unplaced))
+        return self.config.color * color, self.config.shape * shape
+
     def is_due(self, step: int) -> bool:
         """Whether the targets are to be taken anew at a step."""
         start, every = self.config.start, self.config.every
         first = step == start or (step > start and not self.target.any())
-        return max(self.unobserved, self.unplaced) > 1e-3 and (first or (step > start and step % every == 0))
+        return any(self._weights()) and (first or (step > start and step % every == 0))
 
     def terms(self, answers: Answers, step: int, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         r"""The weighted loss terms of a step.
@@ -233,9 +241,8 @@ class Completion(nn.Module):
             step: of the training.
             generator: draws the points.
         """
-        config = self.config
-        color, shape = config.color * self.unobserved, config.shape * self.unplaced
-        if step < config.start or max(color, shape) < 1e-6:
+        config, (color, shape) = self.config, self._weights()
+        if step < config.start or not (color or shape):
             return {}
         on = self._on_surface()
         drawn = [
@@ -244,7 +251,8 @@ class Completion(nn.Module):
         index, away = (torch.cat(parts) for parts in zip(*drawn, strict=True))
         x = on.points[index] + (self.offset[index] + away)[:, None] * on.normals[index]
         answer = answers(x, on.nearest[index])
-        found, terms = (answer,) if answer.base is None else (answer, answer.base), {}
+        found = (answer,) if answer.base is None else (answer, answer.base)
+        terms = {}
         if color > 0:
             first = slice(0, config.points)
             off = torch.stack([(f.color[first] - self.target[index[first]]).square().mean() for f in found])

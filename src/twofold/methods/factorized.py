@@ -93,10 +93,9 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
     def _two_branches(self) -> bool:
         return self.config.field.branches in ("both", "high_rendered")
 
-    @property
-    def one_thread_each(self) -> bool:
-        """See `Avatar.one_thread_each`: so it is with feature grids."""
-        return not self.field.dense
+    def one_thread_each(self, rays: int) -> bool:
+        """See `Avatar.one_thread_each`: steps of feature grids are many small operations."""
+        return not self.field.dense and rays <= FEW_RAYS
 
     def compiled(self) -> AbstractContextManager[bool]:
         """See `Avatar.compiled`. Feature grids have compiled loops of their own."""
@@ -137,3 +136,7 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
         else:
             answer = self.field(x_canonical, posed.own.condition, to_observation)
         return answer if branch == "full" else answer.base or answer
+
+
+FEW_RAYS = 8192
+"""Rays of a step up to which PyTorch's operations on feature grids are faster on one thread each."""

@@ -155,7 +155,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         if self.refinement.parts and step and step % refresh == 0 and step >= self.config.pose.refine_from:
             with torch.no_grad():
                 self._follow(*self._refined())
-        # In poses that do not depend on what this step shows: so any number of processes find the same.
+        # In the first frame's pose, whatever this step shows: so any number of processes find the same.
         if self.search is not None and mode.training and self.search.is_due(step):
             self.search.refresh(self.field.sdf_at(self._posed(0, mode).own.condition))
         if (own := self.completion) is not None and own.is_due(step):
@@ -187,7 +187,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
             self._shells.pop(row, None)
 
     def after_step(self, mode: Mode, capture: Capture) -> Literal["continue", "restart"]:
-        """Takes out of the corrections what no training camera sees, where that is asked for; see `TrainingGrid`."""
+        """Applies what the step recorded to the search grid; removes pose corrections that no camera observes."""
         if self.search is not None:
             self.search.settle()
         pose = self.config.pose
@@ -306,7 +306,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         version = (self._steps, *(parameter._version for parameter in self.field.parameters()))
         query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, version)
         if self.search is not None and mode.training:
-            query = replace(query, distance=self.search.watching(query.distance), grid=self.search.grid)
+            query = replace(query, distance=self.search.recording(query.distance), grid=self.search.grid)
         placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
         shading = self.config.outliers_in_shading and not mode.training
         return placed if shading else replace(placed, outlier=torch.zeros_like(placed.outlier))

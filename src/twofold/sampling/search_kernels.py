@@ -132,8 +132,16 @@ def mark_possible(number, ray_at, point, grid, beta, least, step, possible):  # 
 def _distance_at(x, y, z, values, low, inverse):  # noqa: ANN001, ANN202
     """The trilinear distance of a grid at a point; huge where it is not known."""
     u, v, w = (x - low[0]) * inverse, (y - low[1]) * inverse, (z - low[2]) * inverse
-    a, b, c = int(np.floor(u)), int(np.floor(v)), int(np.floor(w))
-    if a < 0 or b < 0 or c < 0 or a + 1 >= values.shape[0] or b + 1 >= values.shape[1] or c + 1 >= values.shape[2]:
+    size_x, size_y, size_z = values.shape
+    # Before numbers become integers: huge ones and NaN have none.
+    if not (0 <= u < size_x - 1 and 0 <= v < size_y - 1 and 0 <= w < size_z - 1):
+        return _NOWHERE
+    a, b, c = int(u), int(v), int(w)
+    largest = max(
+        max(values[a, b, c], values[a, b, c + 1], values[a, b + 1, c], values[a, b + 1, c + 1]),
+        max(values[a + 1, b, c], values[a + 1, b, c + 1], values[a + 1, b + 1, c], values[a + 1, b + 1, c + 1]),
+    )
+    if largest >= _KNOWN:
         return _NOWHERE
     u, v, w = u - np.float32(a), v - np.float32(b), w - np.float32(c)
     x00 = values[a, b, c] + w * (values[a, b, c + 1] - values[a, b, c])
@@ -158,20 +166,13 @@ def collect_residuals(x, sdf, values, low, inverse, pull, weight):  # noqa: ANN0
         weight: sum of its weights.
     """
     total, count = 0.0, 0
-    size_x, size_y, size_z = values.shape
     for s in range(x.shape[0]):
-        u, v, w = (x[s, 0] - low[0]) * inverse, (x[s, 1] - low[1]) * inverse, (x[s, 2] - low[2]) * inverse
-        a, b, c = int(np.floor(u)), int(np.floor(v)), int(np.floor(w))
-        if a < 0 or b < 0 or c < 0 or a + 1 >= size_x or b + 1 >= size_y or c + 1 >= size_z:
-            continue
-        u, v, w = u - np.float32(a), v - np.float32(b), w - np.float32(c)
-        middle = _ZERO
-        for i in range(2):
-            for j in range(2):
-                for k in range(2):
-                    middle += _share(u, i) * _share(v, j) * _share(w, k) * values[a + i, b + j, c + k]
+        middle = _distance_at(x[s, 0], x[s, 1], x[s, 2], values, low, inverse)
         if middle >= _KNOWN:
             continue
+        u, v, w = (x[s, 0] - low[0]) * inverse, (x[s, 1] - low[1]) * inverse, (x[s, 2] - low[2]) * inverse
+        a, b, c = int(u), int(v), int(w)
+        u, v, w = u - np.float32(a), v - np.float32(b), w - np.float32(c)
         residual = sdf[s] - middle
         total += abs(residual)
         count += 1

@@ -84,8 +84,8 @@ class ShellSampler:
     def training_grid(self, canonical: Float[Tensor, "V 3"]) -> TrainingGrid | None:
         """What finds samples of a field that is trained around this canonical body; None where nothing does."""
         voxel = self.training_grid_voxel
-        # Samples are mapped to places that are as far from the canonical body as they were from the posed one, or less
-        # than a cell further.
+        # Nearly all samples are mapped to places that are as far from the canonical body as they were from the posed
+        # one, or less than a cell further; the field is queried at the others.
         return TrainingGrid(canonical, voxel, self.radius + voxel) if voxel and self.min_weight else None
 
     def build(

@@ -66,7 +66,6 @@ class Walk:
     Attributes:
         ray_ids: which rays meet the shell's box.
         step: distance between samples, metres.
-        k: how many nearest vertices count.
         given: what `walk_kernels.map_candidates` takes before the candidates.
         spacing: how far the body's surface may be from the nearest of its vertices, metres.
         chosen: some candidates, as `on_rays` has all; None for all.

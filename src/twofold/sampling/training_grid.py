@@ -1,10 +1,10 @@
-"""A grid of signed distances that follows a field while it is trained, and finds samples for the field to look at."""
+"""A grid of signed distances that follows a field in training and finds the samples worth a query of the field."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from twofold.kernels.parallel import summed_over_processes
+from twofold.kernels.processes import summed_over_processes
 from twofold.sampling import search_kernels as kernels
 from twofold.sampling.sdf_grid import Distance, SdfGrid, differences, grid_nodes, query_nodes
 
@@ -15,8 +15,8 @@ _TRIALS = 2048
 _SPREAD = 3.0
 """Error of the grid in mean differences: of differences that fall off exponentially 95 % are smaller.
 
-Samples that just count lie one or two centimetres from the surface, so a difference beyond the error costs light that
-hardly anybody sees; and what the grid finds is shown to the field itself before it is shaded."""
+Samples with the least weight that counts lie one or two centimetres from the surface, so a difference beyond the error
+misses samples of little weight; and the field itself is queried at what the grid finds before that is shaded."""
 _RECENT = 0.1
 """Weight of the newest step in the mean difference."""
 Residuals = tuple[Tensor, Tensor, Tensor]
@@ -39,7 +39,7 @@ class TrainingGrid(nn.Module):
         self.register_buffer("values", self._nodes.filled(torch.zeros(len(self._nodes.positions)), 0.0).values)
         # Negative until there are values.
         self.register_buffer("error", torch.tensor(-1.0))
-        self._noted: Residuals | None = None
+        self._recorded: Residuals | None = None
 
     def is_due(self, step: int) -> bool:
         """Whether all nodes are to be queried before this step."""
@@ -62,26 +62,26 @@ class TrainingGrid(nn.Module):
         error, low = float(self.error), self._nodes.low.to(self.values.device)
         return SdfGrid(self.values, low, self._nodes.voxel, error) if error >= 0 else None
 
-    def watching(self, distance: Distance) -> Distance:
-        """A field's distance, that also teaches the grid what it returns."""
+    def recording(self, distance: Distance) -> Distance:
+        """A wrapper of a field's distance that also records the residuals of the grid."""
 
-        def watched(x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        def recorded(x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
             sdf = distance(x)
-            self.learn(x, sdf)
+            self.record(x, sdf)
             return sdf
 
-        return watched
+        return recorded
 
     @torch.no_grad()
-    def learn(self, x: Float[Tensor, "n 3"], sdf: Float[Tensor, "n"]) -> None:
-        """Takes note of a field's distances at points, metres, for `settle`."""
+    def record(self, x: Float[Tensor, "n 3"], sdf: Float[Tensor, "n"]) -> None:
+        """Records the residuals of the grid for `settle`: points and the field's distances there, metres."""
         grid = self.grid
         if grid is not None and len(x):
-            self._noted = add_residuals(grid, x, sdf, self._noted)
+            self._recorded = add_residuals(grid, x, sdf, self._recorded)
 
     @torch.no_grad()
     def settle(self) -> None:
-        r"""Moves the nodes towards the distances that were noted in a step, and the error towards what it was.
+        r"""Applies the residuals recorded in a step to the nodes, and their mean to the error.
 
         \[ v_k \leftarrow v_k + \frac{\sum_i w_{ik} (s_i - \tilde s(x_i))}{\sum_i w_{ik}}, \qquad
             \epsilon \leftarrow 0.9 \, \epsilon + 0.1 \cdot 3 \, \overline{|s_i - \tilde s(x_i)|} \]
@@ -92,13 +92,13 @@ class TrainingGrid(nn.Module):
         if grid is None:
             return
         # Also where this process has nothing to add: the others wait for it.
-        self._noted = self._noted or _nothing(grid)
-        pull, weight, sums = (summed_over_processes(tensor) for tensor in self._noted)
+        self._recorded = self._recorded or _nothing(grid)
+        pull, weight, sums = (summed_over_processes(tensor) for tensor in self._recorded)
         total, count = sums.tolist()
         if count:
             self.values += pull / weight.clamp_min(1e-6)
             self.error += _RECENT * (_SPREAD * total / count - self.error)
-        for tensor in self._noted:
+        for tensor in self._recorded:
             tensor.zero_()
 
     def take_on(self, state: dict[str, Tensor], prefix: str) -> None:
@@ -109,7 +109,7 @@ class TrainingGrid(nn.Module):
 
 @torch.no_grad()
 def add_residuals(
-    grid: SdfGrid, x: Float[Tensor, "n 3"], sdf: Float[Tensor, "n"], noted: Residuals | None = None
+    grid: SdfGrid, x: Float[Tensor, "n 3"], sdf: Float[Tensor, "n"], recorded: Residuals | None = None
 ) -> Residuals:
     """Adds up by how much a grid is wrong at points, for each node around them.
 
@@ -117,26 +117,26 @@ def add_residuals(
         grid: of distances.
         x: points, metres; those where the grid is not known are left out.
         sdf: what the distances there should be, metres.
-        noted: what was added up before, which is changed; None begins anew.
+        recorded: what was added up before, which is changed; None begins anew.
 
     Returns:
         each node's sum of weights times residuals, and of weights; sum and number of the absolute residuals.
     """
-    pull, weight, sums = noted = noted or _nothing(grid)
+    pull, weight, sums = recorded = recorded or _nothing(grid)
     if not x.is_cuda and x.dtype == torch.float32:
         given = (t.contiguous().numpy() for t in (x, sdf.float()))
         found = kernels.collect_residuals(*given, *grid.arrays()[:3], pull.numpy(), weight.numpy())
         sums += torch.tensor(found)
-        return noted
+        return recorded
     middle, (index, weights) = grid.interpolate(x), grid.corners(x)
     known = (~middle.isnan()).nonzero()[:, 0]
     residual = sdf.to(middle.dtype)[known] - middle[known]
-    index, weights = index[known].flatten(), weights[known]
-    pull.view(-1).index_add_(0, index, (weights * residual[:, None]).flatten())
+    index, weights = index[known].flatten(), weights[known].to(pull.dtype)
+    pull.view(-1).index_add_(0, index, (weights * residual[:, None]).to(pull.dtype).flatten())
     weight.view(-1).index_add_(0, index, weights.flatten())
     sums[0] += residual.abs().sum()
     sums[1] += len(known)
-    return noted
+    return recorded
 
 
 def _nothing(grid: SdfGrid) -> Residuals:

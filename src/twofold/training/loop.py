@@ -201,8 +201,6 @@ def train(
         found = None if resume else avatar.check_capture(capture)
         first = before_first(avatar) if before_first else None
         notes = [note for note in (first, found, settled) if note]
-        if avatar.one_thread_each and device.type == "cpu":
-            at_the_end.enter_context(one_thread_each())
         if wants_compiling(config, device):
             notes.append(COMPILED if at_the_end.enter_context(avatar.compiled()) else NOTHING_COMPILED)
         if say and team.leads:
@@ -219,7 +217,8 @@ def train(
         if curves is not None:
             at_the_end.callback(curves.close)
         while run.step < run.steps:
-            terms, error = run.advance()
+            with run.threads():
+                terms, error = run.advance()
             done, steps = run.step, run.steps
             report, stop = _agreed(team, recipe, terms, error, stopped(), done, steps)
             if avatar.after_step(run.mode, capture) == "restart":
@@ -327,6 +326,12 @@ class _Run:
         source = PixelSource(frames, subject.body, subject.betas, chosen.training.pixels, *margins)
         module = Step(self.avatar, source, self.color, chosen, self.seed, self.colors)
         self.module = self.team.shared(module) if self.team.size > 1 else module
+
+    def threads(self) -> contextlib.AbstractContextManager[None]:
+        """While the block lasts, PyTorch's operations take as many threads as pay for a step of this stage."""
+        training = self.stages[self.current].training
+        small = self.avatar.one_thread_each(training.pixels.rays * training.images_per_step)
+        return one_thread_each() if small and self.color.device.type == "cpu" else contextlib.nullcontext()
 
     def advance(self) -> tuple[dict[str, Tensor], Tensor]:
         """Makes one step."""
