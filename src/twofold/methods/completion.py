@@ -29,6 +29,8 @@ ENOUGH = 0.7
 """Weight from which a vertex is left alone."""
 WELL_OBSERVED = 0.9
 """Share of the surface from which on nothing is completed: of what images show for colours, of outlines for shape."""
+SEEN = 0.25
+"""How strongly a surface is pulled to the completed shape that images show, but no outline, beside one that none shows."""
 LEAST_SHARE = 1e-3
 """Share of the surface below which completing it is not worth a term."""
 NEWTON = 3
@@ -164,7 +166,8 @@ class Completion(nn.Module):
 
             nearest = torch.from_numpy(fill.samples.nearest).to(self.vertices.device)
             normals = torch.nn.functional.normalize(at(self.normals), dim=-1)
-            ends, shape_ends = (_lacking(at(known)).cumsum(0) for known in (self.weight, self.placed))
+            lacking = _lacking(at(self.weight))
+            ends, shape_ends = lacking.cumsum(0), _lacking_shape(lacking, at(self.placed)).cumsum(0)
             self._surface = _Surface(fill, at(self.vertices), normals, nearest, ends, shape_fill, shape_ends)
         return self._surface
 
@@ -204,15 +207,15 @@ class Completion(nn.Module):
     @property
     def unobserved(self) -> float:
         """Share of the surface that was not observed, each point counted by how badly it was."""
-        return self._share(self.weight)
+        return self._share(_lacking(self.weight))
 
     @property
     def unplaced(self) -> float:
-        """Share of the surface that lay on no outline, likewise."""
-        return self._share(self.placed)
+        """Share of the surface whose shape is completed, each point counted by how strongly."""
+        return self._share(_lacking_shape(_lacking(self.weight), self.placed))
 
-    def _share(self, known: Float[Tensor, "V"]) -> float:
-        return float((_lacking(known) * self.area).sum() / self.area.double().sum().clamp_min(1e-12))
+    def _share(self, lacking: Float[Tensor, "V"]) -> float:
+        return float((lacking * self.area).sum() / self.area.double().sum().clamp_min(1e-12))
 
     def _weights(self) -> tuple[float, float]:
         """Weights of the terms of colour and shape: the settings times shares of the surface, tiny ones left out."""
@@ -291,3 +294,8 @@ class _Surface(NamedTuple):
 def _lacking(known: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     """How badly points are known, 0..1, by how well they are."""
     return (1 - known.double() / ENOUGH).clamp_min(0)
+
+
+def _lacking_shape(lacking: Float[Tensor, "n"], placed: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """How badly the place of points is known, 0..1, by how badly their colours are and how often outlines showed them."""
+    return torch.maximum(lacking, SEEN * _lacking(placed))
