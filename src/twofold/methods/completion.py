@@ -30,7 +30,8 @@ ENOUGH = 0.7
 WELL_OBSERVED = 0.9
 """Share of the surface from which on nothing is completed: of what images show for colours, of outlines for shape."""
 SEEN = 0.25
-"""How strongly a surface is pulled to the completed shape that images show, but no outline, beside one that none shows."""
+"""How strongly a surface is pulled to the completed shape that images show, but on no outline, beside one that no image
+shows."""
 LEAST_SHARE = 1e-3
 """Share of the surface below which completing it is not worth a term."""
 NEWTON = 3
@@ -297,5 +298,5 @@ def _lacking(known: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
 
 
 def _lacking_shape(lacking: Float[Tensor, "n"], placed: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """How badly the place of points is known, 0..1, by how badly their colours are and how often outlines showed them."""
+    """How badly the place of points is known, 0..1, by how badly their colours are and how well outlines show it."""
     return torch.maximum(lacking, SEEN * _lacking(placed))
