@@ -32,6 +32,8 @@ WELL_OBSERVED = 0.9
 SEEN = 0.25
 """How strongly a surface is pulled to the completed shape that images show, but on no outline, beside one that no image
 shows."""
+TOLERANCE = 0.01
+"""How far such a surface may be from the completed shape, metres: shading shows its details, but not how thick it is."""
 LEAST_SHARE = 1e-3
 """Share of the surface below which completing it is not worth a term."""
 NEWTON = 3
@@ -235,10 +237,11 @@ class Completion(nn.Module):
         At points $p$ of the body drawn with probability proportional to their unobserved area, and points
         $x = p + (t_p + \epsilon) n_p$ about the completed surface, with the share $u$ of the area that is unobserved,
 
-        \[ L_{color} = u \, E \lVert c(x) - \hat c_p \rVert^2, \qquad L_{shape} = u' \, E (s(x') - \epsilon)^2 \]
+        \[ L_{color} = u \, E \lVert c(x) - \hat c_p \rVert^2, \qquad L_{shape} = u' \, E \max(|s(x') - \epsilon| - \tau_p, 0)^2 \]
 
         The colour of a point is observed where an image shows it, its place where it lies on the outline of one: from
-        the front a leg looks alike whatever its depth. So the second term has points $x'$ and a share $u'$ of its own.
+        the front a leg looks alike whatever its depth. So the second term has points $x'$ and a share $u'$ of its own,
+        and leaves a surface that images show a tolerance $\tau_p$ of up to 1 cm.
 
         Args:
             answers: the field.
@@ -263,8 +266,9 @@ class Completion(nn.Module):
             terms["completion_color"] = color * off.mean()
         if shape > 0:
             last = slice(-config.points, None)
-            off = torch.stack([((f.sdf[last] - away[last]) * 100).square().mean() for f in found])
-            terms["completion_shape"] = shape * off.mean()
+            free = TOLERANCE * (self.weight[on.nearest[index[last]]] / ENOUGH).clamp_max(1)
+            off = torch.stack([(f.sdf[last] - away[last]).abs() - free for f in found])
+            terms["completion_shape"] = shape * (100 * off.clamp_min(0)).square().mean()
         return terms
 
     def _draw(
