@@ -244,6 +244,25 @@ def test_shape_is_completed_where_all_colours_were_observed_but_outlines_lack(pe
     assert set(terms) == {"completion_shape"}
 
 
+def test_a_surface_that_images_show_is_free_within_a_centimetre(person, generator):
+    avatar = completing_recipe(1).method.build(Subject.of(person))
+    coverage, completion = coverage_of(person), avatar.completion
+    ones = torch.ones_like(coverage.weight)
+    completion.prepare(replace(coverage, weight=ones, outline=0.9 * (coverage.outline > 2)), torch.zeros_like(ones))
+    on, losses = completion._on_surface(), {}
+    for wrong in (0.005, 0.03):
+
+        def answer(x, vertex, wrong=wrong):
+            nearest = torch.cdist(x, on.points).argmin(1)
+            away = ((x - on.points[nearest]) * on.normals[nearest]).sum(-1)
+            return FieldOutput(away + wrong, torch.zeros_like(x), None)
+
+        losses[wrong] = float(completion.terms(answer, 1000, generator)["completion_shape"])
+    # Off by 2 cm more than that: the squares of centimetres, by weight and share.
+    assert losses[0.005] < 0.01 * losses[0.03]
+    assert losses[0.03] == pytest.approx(completion.config.shape * completion.unplaced * 4, rel=0.15)
+
+
 def test_a_share_too_small_for_targets_has_no_terms(person, generator):
     """Else the field would be pulled to targets that were never taken."""
     avatar = completing_recipe(1).method.build(Subject.of(person))

@@ -33,7 +33,7 @@ SEEN = 0.25
 """How strongly a surface is pulled to the completed shape that images show, but on no outline, beside one that no image
 shows."""
 TOLERANCE = 0.01
-"""How far such a surface may be from the completed shape, metres: shading shows its details, but not how thick it is."""
+"""How far such a surface may be from the completed shape, metres: shading shows its details, not how thick it is."""
 LEAST_SHARE = 1e-3
 """Share of the surface below which completing it is not worth a term."""
 NEWTON = 3
@@ -237,7 +237,8 @@ class Completion(nn.Module):
         At points $p$ of the body drawn with probability proportional to their unobserved area, and points
         $x = p + (t_p + \epsilon) n_p$ about the completed surface, with the share $u$ of the area that is unobserved,
 
-        \[ L_{color} = u \, E \lVert c(x) - \hat c_p \rVert^2, \qquad L_{shape} = u' \, E \max(|s(x') - \epsilon| - \tau_p, 0)^2 \]
+        \[ L_{color} = u \, E \lVert c(x) - \hat c_p \rVert^2, \qquad
+            L_{shape} = u' \, E \max(|s(x') - \epsilon| - \tau_p, 0)^2 \]
 
         The colour of a point is observed where an image shows it, its place where it lies on the outline of one: from
         the front a leg looks alike whatever its depth. So the second term has points $x'$ and a share $u'$ of its own,
