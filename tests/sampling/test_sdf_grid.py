@@ -1,11 +1,12 @@
 """A grid of distances claims no more than it knows, but for one place in a hundred."""
 
+import numpy as np
 import pytest
 import torch
 from little_body import ball
 
+from twofold.sampling import search_kernels
 from twofold.sampling.sdf_grid import KNOWN_BELOW, UNKNOWN, SdfGrid, grid_nodes, tabulate
-from twofold.sampling.training_grid import add_residuals
 
 POINTS = torch.from_numpy(ball()[0])
 CENTER, RADIUS = POINTS.mean(0), float((POINTS - POINTS.mean(0)).norm(dim=1).mean())
@@ -82,6 +83,9 @@ def test_beside_a_node_that_is_not_known_nothing_is():
     )
     unknown = [True, True, False, True, True, True]
     assert grid.interpolate(x).isnan().tolist() == unknown
-    # The compiled loop and its twin: one of the points is known, and off by 1 m.
-    for points in (x, x.double()):
-        assert add_residuals(grid, points, torch.ones(len(x)))[2].tolist() == [1.0, 1.0]
+    # The compiled loop: 1 m outside the surface no sample counts, and where nothing is known every one may.
+    outside = SdfGrid(torch.where(values == UNKNOWN, UNKNOWN, 1.0), torch.zeros(3), 1.0, 0.0)
+    possible, number = np.empty(len(x), bool), np.arange(len(x))
+    own = np.float32(0.01), np.float32(1e-3), np.float32(0.01)
+    search_kernels.mark_possible(number, number, x.numpy(), outside.arrays(), *own, possible)
+    assert possible.tolist() == unknown

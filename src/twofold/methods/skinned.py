@@ -32,7 +32,6 @@ from twofold.metrics.perceptual import LPIPS
 from twofold.sampling.placement import Deformation, FieldQuery, Placement, Sampler
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.shell import Shell
-from twofold.sampling.training_grid import TrainingGrid
 from twofold.volume.rendering import composite, composite_weights, laplace_density
 from twofold.volume.samples import Samples
 
@@ -84,7 +83,6 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         self._perceptual: tuple[LPIPS, ...] = ()
         self.deformation = Deformation(config.falloff, config.outlier_distance / self.scale, self.scale)
         self._sampler: Sampler = config.sampler.build(self.deformation, canonical.canonical_vertices, canonical.faces)
-        self.search: TrainingGrid | None = config.sampler.training_grid(canonical.canonical_vertices)
         self.completion: Completion | None = None
         if config.completion.active:
             self.completion = Completion(config.completion, given, canonical.canonical_vertices)
@@ -101,9 +99,8 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
 
     def load_stored(self, state: dict[str, Tensor]) -> None:
         """See `Avatar.load_stored`."""
-        for name in ("search", "completion"):
-            if (own := getattr(self, name)) is not None:
-                own.take_on(state, f"{name}.")
+        if self.completion is not None:
+            self.completion.take_on(state, "completion.")
 
     def answer_beside(self, x_canonical: Float[Tensor, "S 3"], vertex: Int[Tensor, "S"], posed: Posed) -> FieldOutput:
         """What completion takes its targets from and pulls to them, at canonical points beside these vertices."""
@@ -155,10 +152,8 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         if self.refinement.parts and step and step % refresh == 0 and step >= self.config.pose.refine_from:
             with torch.no_grad():
                 self._follow(*self._refined())
-        # In the first frame's pose, whatever this step shows: so any number of processes find the same.
-        if self.search is not None and mode.training and self.search.is_due(step):
-            self.search.refresh(self.field.sdf_at(self._posed(0, mode).own.condition))
         if (own := self.completion) is not None and own.is_due(step):
+            # In the first frame's pose, whatever this step shows: so any number of processes find the same.
             posed = self._posed(0, mode)
             own.refresh(lambda x, v: self.answer_beside(x, v, posed), self.light_beside(own.beside, posed))
 
@@ -187,9 +182,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
             self._shells.pop(row, None)
 
     def after_step(self, mode: Mode, capture: Capture) -> Literal["continue", "restart"]:
-        """Applies what the step recorded to the search grid; removes pose corrections that no camera observes."""
-        if self.search is not None:
-            self.search.settle()
+        """Takes out of the corrections what no training camera sees, where that is asked for."""
         pose = self.config.pose
         if pose.observed_only and self.refinement.parts and (mode.step or 0) >= pose.refine_from:
             if self._observed is None:
@@ -305,8 +298,6 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         """The samples that `render` shades."""
         version = (self._steps, *(parameter._version for parameter in self.field.parameters()))
         query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, version)
-        if self.search is not None and mode.training:
-            query = replace(query, distance=self.search.recording(query.distance), grid=self.search.grid)
         placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
         shading = self.config.outliers_in_shading and not mode.training
         return placed if shading else replace(placed, outlier=torch.zeros_like(placed.outlier))

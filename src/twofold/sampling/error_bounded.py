@@ -187,10 +187,6 @@ class ErrorBoundedSampler:
         """
         return joint_box(given(), scale) if self.box == "given" else joint_box(joints)
 
-    def training_grid(self, canonical: Float[Tensor, "V 3"]) -> None:
-        """None: this sampler asks the field for every distance."""
-        return
-
     def build(
         self, deformation: Deformation, canonical: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
     ) -> "ErrorBoundedPlacer":

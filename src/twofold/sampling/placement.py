@@ -10,7 +10,7 @@ from torch import Tensor
 from twofold.deform.skinning import map_to_canonical, weights_by, with_pose_gradient
 from twofold.geometry.cameras import Rays
 from twofold.sampling.posed_surface import PosedSurface
-from twofold.sampling.sdf_grid import Distance, SdfGrid
+from twofold.sampling.sdf_grid import Distance
 from twofold.volume.samples import Samples
 
 
@@ -41,14 +41,11 @@ class FieldQuery:
         distance: signed distance at canonical points, metres.
         beta: scale of the Laplace density, metres.
         version: changes whenever the field's parameters do.
-        grid: these distances on a grid, nearly everywhere within its error of them, while the field is trained; a
-            sampler may look there first.
     """
 
     distance: Distance
     beta: Float[Tensor, ""]
     version: tuple[int, ...] = ()
-    grid: SdfGrid | None = None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from twofold.sampling.pruning import miswarped, visible
 from twofold.sampling.sdf_grid import SdfGrid, tabulate
 from twofold.sampling.shell import Shell, build_shell, expected_samples, nearest_listed, sample_shell
 from twofold.sampling.shell_walk import Walk, can_walk, parts_of_step, start_walk
-from twofold.sampling.training_grid import TrainingGrid
 from twofold.volume.samples import Samples
 
 _GRID_PAYS = 150_000
@@ -48,19 +47,16 @@ class ShellSampler:
     sdf_grid_voxel: float = 0.015
     """Rendering of large images: spacing of a grid of signed distances, queried once a pose, that finds most samples to
     be empty or hidden before the field is queried; metres, 0 queries the field for every sample."""
-    training_grid_voxel: float = 0.02
-    """Training: spacing of a grid of signed distances that follows the field and does the same; metres, 0 for none."""
 
     def __post_init__(self) -> None:
         """Refuses sizes that leave nothing to sample."""
         # The voxels of a body fill half a gigabyte at the smallest edge; a ray crosses it in a thousand steps.
         require_within(
             self, radius=(0.005, 0.5), step=(0.001, 0.5), voxel=(0.005, 0.5), min_weight=(0, 1), miswarp_slack=(0, 0.5),
-            sdf_grid_voxel=(0, 0.5), training_grid_voxel=(0, 0.5), leap=(0, 1), finest=(0, 0.5),
+            sdf_grid_voxel=(0, 0.5), leap=(0, 1), finest=(0, 0.5),
         )  # fmt: skip
-        for name in ("sdf_grid_voxel", "training_grid_voxel"):
-            if 0 < (voxel := getattr(self, name)) < 0.004:
-                raise ValueError(f"{name}={voxel:g} should be 0.004 to 0.5, or 0 for no grid")
+        if 0 < self.sdf_grid_voxel < 0.004:
+            raise ValueError(f"sdf_grid_voxel={self.sdf_grid_voxel:g} should be 0.004 to 0.5, or 0 for no grid")
         if 0 < self.finest < 5e-4:
             raise ValueError(f"finest={self.finest:g} should be 0.0005 to 0.5, or 0 to leave steps as they are")
         if self.finest > 0 and self.min_weight == 0:
@@ -80,13 +76,6 @@ class ShellSampler:
     ) -> Float[Tensor, "2 3"]:
         """A box around the posed joints; rays are bounded by the shell instead."""
         return joint_box(joints)
-
-    def training_grid(self, canonical: Float[Tensor, "V 3"]) -> TrainingGrid | None:
-        """What finds samples of a field that is trained around this canonical body; None where nothing does."""
-        voxel = self.training_grid_voxel
-        # Nearly all samples are mapped to places that are as far from the canonical body as they were from the posed
-        # one, or less than a cell further; the field is queried at the others.
-        return TrainingGrid(canonical, voxel, self.radius + voxel) if voxel and self.min_weight else None
 
     def build(
         self, deformation: Deformation, canonical: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
@@ -115,7 +104,7 @@ class ShellPlacer:
         least, shell = self.config.min_weight, self._shell(surface)
         if least == 0:
             return self.well_warped(rays, surface, generator)
-        grid = query.grid if training else self._grid(shell, rays, surface, query)
+        grid = None if training else self._grid(shell, rays, surface, query)
         if can_walk(shell, rays):
             walk = self._walk(shell, rays, surface, generator)
             return walk.seen(query, least, self.config.leap, self.config.finest, grid)

@@ -13,7 +13,6 @@ from torch import Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from twofold.errors import TwofoldError
-from twofold.kernels.processes import summed_over_processes
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,9 @@ class Team:
 
     def mean(self, values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         """Mean over all processes, the same in each of them."""
-        return summed_over_processes(values) / self.size
+        if self.size > 1:
+            distributed.all_reduce(values)
+        return values / self.size
 
     def shared(self, module: nn.Module) -> nn.Module:
         """The module with gradients that are the mean over all processes."""
