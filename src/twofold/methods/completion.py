@@ -28,12 +28,7 @@ LOWEST, HIGHEST = -0.04, 0.09
 ENOUGH = 0.7
 """Weight from which a vertex is left alone."""
 WELL_OBSERVED = 0.9
-"""Share of the surface from which on nothing is completed: of what images show for colours, of outlines for shape."""
-SEEN = 0.25
-"""How strongly a surface is pulled to the completed shape that images show, but on no outline, beside one that no image
-shows."""
-TOLERANCE = 0.01
-"""How far such a surface may be from the completed shape, metres: shading shows its details, not how thick it is."""
+"""Share of the surface from which on nothing is completed: that images show, for the shape also that outlines do."""
 LEAST_SHARE = 1e-3
 """Share of the surface below which completing it is not worth a term."""
 NEWTON = 3
@@ -54,6 +49,10 @@ class CompletionConfig:
     """Weight of the squared difference to the completed colour; 0 for both weights leaves completion out."""
     shape: float = 0.0
     """Weight of the squared difference to the completed distance, centimetres."""
+    outlines: float = 0.0
+    """How strongly the shape is completed where images show the body but no outline does, 0 to 1 times as strongly as
+    where no image shows it: before few cameras only outlines say how thick limbs are. For poses as good as a fit to
+    several cameras; where poses are rough, outlines and masks disagree."""
     light: float = 0.0
     """Weight of what is not linear in the normal in the law of light, for fields that have one; 0.1 cost 0.2 dB of the
     training images of a synthetic subject, and gained nothing."""
@@ -72,6 +71,7 @@ class CompletionConfig:
             self,
             color=(0, 1e6),
             shape=(0, 1e6),
+            outlines=(0, 1),
             light=(0, 1e6),
             points=(1, 1_000_000),
             samples=(100, 10_000_000),
@@ -148,7 +148,7 @@ class Completion(nn.Module):
             state |= {
                 f"{prefix}{name}": torch.zeros_like(getattr(self, name)) for name in ("facing", "target", "offset")
             }
-        # Its shape was completed where its colours were.
+        # Their shape was completed where their colours were.
         state.setdefault(f"{prefix}placed", state.get(f"{prefix}weight", self.placed))
 
     def _forget(self) -> None:
@@ -160,9 +160,9 @@ class Completion(nn.Module):
             weight, placed, area, facing = (
                 values.cpu().numpy() for values in (self.weight, self.placed, self.area, self.facing)
             )
-            fill, shape_fill = (
-                SurfaceFill(self.shaped, known, area, facing, self.config.samples) for known in (weight, placed)
-            )
+            fill = shape_fill = SurfaceFill(self.shaped, weight, area, facing, self.config.samples)
+            if self.config.outlines:
+                shape_fill = SurfaceFill(self.shaped, placed, area, facing, self.config.samples)
 
             def at(values: Tensor) -> Tensor:
                 return torch.from_numpy(fill.samples.at(values.cpu().numpy()).astype(np.float32)).to(values)
@@ -170,7 +170,7 @@ class Completion(nn.Module):
             nearest = torch.from_numpy(fill.samples.nearest).to(self.vertices.device)
             normals = torch.nn.functional.normalize(at(self.normals), dim=-1)
             lacking = _lacking(at(self.weight))
-            ends, shape_ends = lacking.cumsum(0), _lacking_shape(lacking, at(self.placed)).cumsum(0)
+            ends, shape_ends = lacking.cumsum(0), self._lacking_shape(lacking, at(self.placed)).cumsum(0)
             self._surface = _Surface(fill, at(self.vertices), normals, nearest, ends, shape_fill, shape_ends)
         return self._surface
 
@@ -215,7 +215,11 @@ class Completion(nn.Module):
     @property
     def unplaced(self) -> float:
         """Share of the surface whose shape is completed, each point counted by how strongly."""
-        return self._share(_lacking_shape(_lacking(self.weight), self.placed))
+        return self._share(self._lacking_shape(_lacking(self.weight), self.placed))
+
+    def _lacking_shape(self, lacking: Float[Tensor, "n"], placed: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """How badly the place of points is known, 0..1, by how badly their colours are and by the outlines."""
+        return torch.maximum(lacking, self.config.outlines * _lacking(placed))
 
     def _share(self, lacking: Float[Tensor, "V"]) -> float:
         return float((lacking * self.area).sum() / self.area.double().sum().clamp_min(1e-12))
@@ -237,12 +241,11 @@ class Completion(nn.Module):
         At points $p$ of the body drawn with probability proportional to their unobserved area, and points
         $x = p + (t_p + \epsilon) n_p$ about the completed surface, with the share $u$ of the area that is unobserved,
 
-        \[ L_{color} = u \, E \lVert c(x) - \hat c_p \rVert^2, \qquad
-            L_{shape} = u' \, E \max(|s(x') - \epsilon| - \tau_p, 0)^2 \]
+        \[ L_{color} = u \, E \lVert c(x) - \hat c_p \rVert^2, \qquad L_{shape} = u' \, E (s(x') - \epsilon)^2 \]
 
         The colour of a point is observed where an image shows it, its place where it lies on the outline of one: from
         the front a leg looks alike whatever its depth. So the second term has points $x'$ and a share $u'$ of its own,
-        and leaves a surface that images show a tolerance $\tau_p$ of up to 1 cm.
+        by `CompletionConfig.outlines`.
 
         Args:
             answers: the field.
@@ -267,9 +270,8 @@ class Completion(nn.Module):
             terms["completion_color"] = color * off.mean()
         if shape > 0:
             last = slice(-config.points, None)
-            free = TOLERANCE * (self.weight[on.nearest[index[last]]] / ENOUGH).clamp_max(1)
-            off = torch.stack([(f.sdf[last] - away[last]).abs() - free for f in found])
-            terms["completion_shape"] = shape * (100 * off.clamp_min(0)).square().mean()
+            off = torch.stack([((f.sdf[last] - away[last]) * 100).square().mean() for f in found])
+            terms["completion_shape"] = shape * off.mean()
         return terms
 
     def _draw(
@@ -300,8 +302,3 @@ class _Surface(NamedTuple):
 def _lacking(known: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     """How badly points are known, 0..1, by how well they are."""
     return (1 - known.double() / ENOUGH).clamp_min(0)
-
-
-def _lacking_shape(lacking: Float[Tensor, "n"], placed: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """How badly the place of points is known, 0..1, by how badly their colours are and how well outlines show it."""
-    return torch.maximum(lacking, SEEN * _lacking(placed))
