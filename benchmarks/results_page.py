@@ -37,8 +37,8 @@ ground truth mask.*
 
 ![A man filmed by four cameras](pictures/real_four.jpg)
 
-*Trained on the first camera (1,500 steps, `method.completion.outlines=1`). Above: the other cameras beside the avatar, the
-lower row in held-out frames. Then an orbit and a novel pose. `python -m benchmarks.real_sheet`.*
+*Trained on the first camera (1,500 steps, `method.completion.outlines=1`). Above: the other cameras beside the avatar,
+the lower row in held-out frames. Then an orbit and a novel pose. `python -m benchmarks.real_sheet`.*
 
 ![The balancing man from prepared poses and masks](pictures/real_p2s.jpg)
 
