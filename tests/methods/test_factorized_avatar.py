@@ -140,7 +140,8 @@ def images(avatar, person):
 
 def test_error_bounded_and_shell_sampler_draw_the_same_image(trained, person):
     """Within one step of 8 bits on average and twelve at any pixel, where both end at the same distance."""
-    shell = ShellSampler(radius=0.06, step=0.004, voxel=0.02, min_weight=0.0)
+    # At the shell's rim lists of vertices decide what is a sample; the avatar's surface reaches it in one pixel.
+    shell = ShellSampler(radius=0.06, step=0.004, voxel=0.03, min_weight=0.0)
     bounded = ErrorBoundedSampler(ends="ray")
     first, second = (
         images(trained_with(trained, sampler=s, outlier_distance=shell.radius), person) for s in (shell, bounded)

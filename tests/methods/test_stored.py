@@ -52,8 +52,8 @@ def test_quick_of_then_is_quick_of_now_but_for_these_settings():
     # Since then rays leap through empty space, and steps near the surface are divided.
     sampler = dataclasses.replace(read.method.sampler, leap=0.7, finest=quick().method.sampler.finest)
     rates = dataclasses.replace(read.method.rates, pose=1e-3)
-    # Since then grids become as fine as the images.
-    field = dataclasses.replace(read.method.field, follow_images=True)
+    # Since then grids become as fine as the images, and the fine networks see fewer numbers of the pose.
+    field = dataclasses.replace(read.method.field, follow_images=True, pose_code=2)
     changed = {"losses": losses, "pose": pose, "sampler": sampler, "rates": rates, "field": field}
     method = dataclasses.replace(read.method, **changed)
     method = method.completing(on=True)

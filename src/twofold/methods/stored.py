@@ -20,7 +20,8 @@ ABSENT: dict[str, dict[str, object]] = {
         "base_mask": 0.0,
     },
     "method.completion": {
-        "color": 0.0, "shape": 0.0, "light": 0.0, "points": 512, "samples": 40_000, "start": 200, "every": 200,
+        "color": 0.0, "shape": 0.0, "outlines": 0.0, "light": 0.0, "points": 512, "samples": 40_000, "start": 200,
+        "every": 200,
     },
     "training": {"epochs": "images", "camera_colors": "off"},
     "training.pixels": {
