@@ -165,6 +165,7 @@ def _studies(results: dict[str, Any]) -> list[str]:
     }
     return [
         f"{titles.get(name, f'## Study {name[6:]}')}\n\n{section(study, _table)}"
+        + (f"\n{study['note']}\n" if "note" in study else "")
         for name, study in results.items()
         if name.startswith("study-")
     ]

@@ -180,7 +180,7 @@ def test_a_grid_finds_the_samples_that_the_field_would_find(started, beta, radiu
     walk, beta = walk_of(started, 0.011), torch.tensor(beta)
     field, asked = BallField(avatar, radius), [BallField(avatar, radius) for _ in range(2)]
     with torch.no_grad():
-        grid = tabulate(field, avatar.canonical_points, 0.015, 0.09)
+        grid = tabulate(field, avatar.canonical_points, 0.015, 0.09, covered=0.99)
         every, found = (
             walk.seen(FieldQuery(own, beta), 2e-3, share, finest, table)
             for own, share, table in zip(asked, (0.0, 0.7), (None, grid), strict=True)

@@ -154,13 +154,9 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
                 self._follow(*self._refined())
         if (own := self.completion) is not None and own.is_due(step):
             # In the first frame's pose, whatever this step shows: so any number of processes find the same.
-            posed = self._posed(0, mode)
+            subject = self.subject
+            posed = self.pose(subject.poses[0], subject.translations[0], int(subject.times[0]), mode)
             own.refresh(lambda x, v: self.answer_beside(x, v, posed), self.light_beside(own.beside, posed))
-
-    def _posed(self, row: int, mode: Mode) -> Posed:
-        """The avatar in the pose of a training frame."""
-        subject = self.subject
-        return self.pose(subject.poses[row], subject.translations[row], int(subject.times[row]), mode)
 
     def _refined(self) -> tuple[Tensor, Tensor]:
         """Poses and translations of all training frames with their corrections."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from twofold.field.grids import build_lattices
 
 UNKNOWN = 1e6
-"""What stands in a grid where the distance is not known, metres; finite, so that stored grids are."""
+"""What stands in a grid where the distance is not known, metres; finite, so that comparisons tell it."""
 KNOWN_BELOW = 1e3
 """Distances of nodes from this on are not known, metres."""
 Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
@@ -26,8 +26,7 @@ class SdfGrid:
         values: signed distance at each node, metres; `UNKNOWN` where it is not known.
         low: the first node, metres.
         voxel: spacing of the nodes, metres.
-        error: bound of the difference between the field and the interpolated distance, exceeded at about one place in a
-            hundred, metres.
+        error: bound of the difference between the field and the interpolated distance, metres; see `tabulate`.
     """
 
     values: Float[Tensor, "X Y Z"]
@@ -97,12 +96,6 @@ class GridNodes:
     low: Float[Tensor, "3"]
     voxel: float
 
-    def to(self, device: torch.device) -> "GridNodes":
-        """The same on a device."""
-        tensors = (tensor.to(device) for tensor in (self.positions, self.flat, self.low))
-        positions, flat, low = tensors
-        return GridNodes(positions, flat, self.shape, low, self.voxel)
-
     def filled(self, values: Float[Tensor, "N"], error: float) -> SdfGrid:
         """The grid with these distances at its nodes, metres."""
         whole = torch.full((self.shape[0] * self.shape[1] * self.shape[2],), UNKNOWN, device=values.device)
@@ -138,13 +131,15 @@ def tabulate(
     radius: float,
     chunk: int = 65_536,
     trials: int = 4096,
+    covered: float = 1.0,
 ) -> SdfGrid:
     r"""Queries a field at the nodes of a grid, and between some of them for the error of the interpolation.
 
-    \[ \epsilon = Q_{99}(|\tilde s(x_t) - s(x_t)|) \]
+    \[ \epsilon = \tfrac32 \max_t |\tilde s(x_t) - s(x_t)| \qquad \text{or} \qquad
+        \epsilon = Q_q(|\tilde s(x_t) - s(x_t)|) \]
 
-    over the places $x_t$ of the trials. At about one place in a hundred the field exceeds this bound; there a sample
-    can be missed whose weight is near the least one that counts.
+    over the places $x_t$ of the trials: of all of them, or of the share $q$ that is to be covered. Where the field
+    exceeds the bound, a sample can be missed whose weight is near the least one that counts.
 
     >>> grid = tabulate(lambda x: x[:, 0] - 0.2, torch.zeros(1, 3), voxel=0.1, radius=0.3)
     >>> low, high = grid.bounds(torch.tensor([[0.25, 0.0, 0.0], [9.0, 0.0, 0.0]]))
@@ -158,13 +153,16 @@ def tabulate(
         radius: how far from the points, metres.
         chunk: points queried at once.
         trials: where the interpolation is tested: random places close to the surface.
+        covered: share of these places at which the grid's error is to hold, $q$.
     """
     nodes = grid_nodes(points, voxel, radius)
     values = query_nodes(nodes, distance, chunk)
     grid = nodes.filled(values, 0.0)
     places = nodes.near_surface(values, trials, torch.Generator().manual_seed(0))
     wrong = differences(grid, distance, places)
-    return nodes.filled(values, float(wrong.quantile(0.99)) if len(wrong) else torch.inf)
+    if len(wrong) == 0:
+        return nodes.filled(values, torch.inf)
+    return nodes.filled(values, float(1.5 * wrong.max() if covered == 1 else wrong.quantile(covered)))
 
 
 @torch.no_grad()

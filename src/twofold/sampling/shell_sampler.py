@@ -22,6 +22,9 @@ from twofold.volume.samples import Samples
 _GRID_PAYS = 150_000
 """Samples from which on an SDF grid at 15 mm, of some eighty thousand nodes, is the quicker way."""
 
+_COVERED = 0.99
+"""Share of places at which the bounds of that grid hold: with those of all places it would rule out few samples."""
+
 
 @dataclass(frozen=True)
 class ShellSampler:
@@ -195,6 +198,8 @@ class ShellPlacer:
             return self._last_grid[2]
         if expected_samples(shell, rays, self.config.step) < _GRID_PAYS * (0.015 / voxel) ** 3:
             return None
-        grid = tabulate(query.distance, self._canonical.to(surface.forward.device), voxel, self.config.radius)
+        grid = tabulate(
+            query.distance, self._canonical.to(surface.forward.device), voxel, self.config.radius, covered=_COVERED
+        )
         self._last_grid = (surface, query.version, grid)
         return grid
