@@ -206,19 +206,3 @@ def test_ignored_pixels_spoil_no_protocol(capture, monkeypatch):
     monkeypatch.setattr(evaluate, "render_frame", spoilt)
     table = evaluate.measure(refined_avatar(()), capture, networks=Networks({}))["novel_pose_protocols"]
     assert table["instantavatar_psnr"] == table["npc_psnr"] == 100
-
-
-def test_a_video_is_the_longest_run_of_one_camera_without_gaps(capture):
-    frame = capture.splits["train"][0]
-    moved = replace(frame.camera, world_to_camera=torch.eye(4) + 0.1)
-    frames = [replace(frame, frame_index=t, camera_name="a") for t in (0, 2, 4, 9, 11, 13, 15)]
-    frames += [
-        replace(frame, frame_index=t, camera_name="b", camera=moved if t > 4 else frame.camera) for t in range(8)
-    ]
-    splits = {**capture.splits, "novel_pose": tuple(frames[::-1])}
-    chosen = evaluate.steady_video(replace(capture, splits=splits))
-    assert {f.camera_name for f in chosen} == {"b"}
-    assert [f.frame_index for f in chosen] == [0, 1, 2, 3, 4]
-    assert len(evaluate.steady_video(replace(capture, splits=splits), 3)) == 3
-    alone = {"train": (frame,), "novel_view": (), "novel_pose": (frame,)}
-    assert evaluate.steady_video(replace(capture, splits=alone)) == []

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 import torch
 
 from twofold.capture.coverage import coverage_of
-from twofold.capture.types import Capture, Frame, spread
+from twofold.capture.types import VIDEO_LENGTH, Capture, Frame, spread, steady_video
 from twofold.capture.validate import read_mesh
 from twofold.errors import NoSurfaceError
 from twofold.files import write_json
@@ -33,8 +32,6 @@ NEAR = 0.5
 """Seconds over which the errors of an estimator's poses last."""
 _MESH = 4.0
 """Images that can be measured while one surface is; a first guess, until one has been."""
-VIDEO_LENGTH = 16
-"""Images of the video whose consistency is measured."""
 SURFACES = {
     "canonical": "marching cubes of the signed distance at {voxel} in canonical space, largest piece, posed by the 7 "
     "nearest body vertices",
@@ -143,6 +140,16 @@ def _with_mesh(capture: Capture, most: int | None) -> dict[int, Frame]:
     return {time: by_index[time] for time in spread([t for t in sorted(capture.meshes) if t in by_index], most)}
 
 
+def require_meshes(capture: Capture, most: int | None = None) -> None:
+    """Reads the true meshes that `measure_geometry` will take, before hours of other work.
+
+    Raises:
+        TwofoldError: one is missing or damaged.
+    """
+    for time in _with_mesh(capture, most):
+        read_mesh(capture.meshes[time])
+
+
 def measure_geometry(
     avatar: Avatar, capture: Capture, most: int | None = None, voxel: float = 0.008,
     progress: Callable[[], None] | None = None,
@@ -202,27 +209,6 @@ def add_picture(means: ProtocolMeans, capture: Capture, frame: Frame, image: Ren
     color = torch.where(ignored[..., None], truth, image.color)
     opacity = torch.where(ignored, mask, image.opacity)
     means.add(color, opacity, mask, capture.background, lambda background: frame.composited(torch.tensor(background)))
-
-
-def steady_video(capture: Capture, most: int = VIDEO_LENGTH) -> list[Frame]:
-    """Successive frames of one camera that stands still: the longest such run of novel poses, else of another split."""
-    best: list[Frame] = []
-    for split in ("novel_pose", "novel_view", "train"):
-        frames = sorted(capture.splits.get(split, ()), key=lambda f: (f.camera_name, f.frame_index))
-        for _, group in groupby(frames, key=lambda f: f.camera_name):
-            taken = list(group)
-            step = min(
-                (b.frame_index - a.frame_index for a, b in pairwise(taken) if b.frame_index > a.frame_index), default=0
-            )
-            run = taken[:1]
-            for before, now in pairwise(taken):
-                still = torch.equal(before.camera.world_to_camera, now.camera.world_to_camera)
-                run = [*run, now] if now.frame_index - before.frame_index == step and still else [now]
-                if len(run) > max(len(best), 1):
-                    best = run
-        if best:
-            break
-    return best[:most]
 
 
 def measure_consistency(
@@ -325,8 +311,7 @@ def measure(
         TwofoldError: an image or mesh is damaged, or the avatar's numbers are not finite.
     """
     few = min(most or 8, 8)
-    for time in _with_mesh(capture, meshes):
-        read_mesh(capture.meshes[time])  # before hours of work
+    require_meshes(capture, meshes)
     images = {name: len(spread(capture.splits.get(name, ()), most)) for name in ("novel_view", "novel_pose")}
     images["train"] = len(spread(capture.train, few))
     # Training images are drawn once more, in the poses as given; held-out ones in both.

@@ -1,6 +1,7 @@
 """Frames read their images when asked."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from PIL import Image
 
 from twofold.capture.folder import read_capture
-from twofold.capture.types import spread
+from twofold.capture.types import spread, steady_video
 
 
 def test_a_frame_reads_colours_and_mask_as_shares_of_one(tiny):
@@ -67,3 +68,20 @@ def test_items_are_spread_evenly_from_the_first_to_the_last(count, most):
         gaps = [b - a for a, b in itertools.pairwise(chosen)]
         assert (chosen[0], chosen[-1]) == (0, count - 1)
         assert max(gaps) - min(gaps) <= 1
+
+
+def test_a_video_is_the_longest_run_of_one_camera_without_gaps(tiny):
+    capture = read_capture(tiny)
+    frame = capture.splits["train"][0]
+    moved = replace(frame.camera, world_to_camera=torch.eye(4) + 0.1)
+    frames = [replace(frame, frame_index=t, camera_name="a") for t in (0, 2, 4, 9, 11, 13, 15)]
+    frames += [
+        replace(frame, frame_index=t, camera_name="b", camera=moved if t > 4 else frame.camera) for t in range(8)
+    ]
+    splits = {**capture.splits, "novel_pose": tuple(frames[::-1])}
+    chosen = steady_video(replace(capture, splits=splits))
+    assert {f.camera_name for f in chosen} == {"b"}
+    assert [f.frame_index for f in chosen] == [0, 1, 2, 3, 4]
+    assert len(steady_video(replace(capture, splits=splits), 3)) == 3
+    alone = {"train": (frame,), "novel_view": (), "novel_pose": (frame,)}
+    assert steady_video(replace(capture, splits=alone)) == []

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import pytest
 from command_line import refused
 
 from twofold.cli.main import main
@@ -27,3 +28,14 @@ def test_what_cannot_be_compared_is_one_sentence_and_nothing_is_written(trained,
     assert "expects two runs or more" in refused(capsys, "compare", trained.folder, "--out", out)
     assert "is no run" in refused(capsys, "compare", trained.folder, tmp_path, "--out", out) or not out.exists()
     assert not out.exists()
+
+
+def test_a_damaged_true_mesh_is_refused_before_anything_is_rendered(trained, tmp_path, capsys, monkeypatch):
+    capture = shutil.copytree(trained.capture.folder, tmp_path / "capture")
+    for mesh in (capture / "meshes").iterdir():
+        mesh.write_bytes(b"no mesh")
+    monkeypatch.setattr("twofold.comparison.measured", lambda *given: pytest.fail("something was measured"))
+    runs = [shutil.copytree(trained.folder, tmp_path / name) for name in ("first", "second")]
+    said = refused(capsys, "compare", *runs, "--capture", capture, "--out", tmp_path / "out")
+    assert f"{capture / 'meshes'}" in said
+    assert not (tmp_path / "out").exists()

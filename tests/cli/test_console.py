@@ -1,5 +1,8 @@
 """Progress is told honestly where nobody watches a terminal."""
 
+import os
+import signal
+
 import pytest
 
 from twofold.cli import console
@@ -61,3 +64,21 @@ def test_the_time_left_follows_the_speed_of_late_and_starts_where_a_resumed_run_
         now += 10
     assert left.seconds() == pytest.approx(38_000, rel=0.25)
     assert len(left._past) < 1200
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGCONT"), reason="no such signal here")
+def test_the_time_that_a_process_was_stopped_does_not_count(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, before = 0.0, signal.getsignal(signal.SIGCONT)
+    for clock in ("time.monotonic", "rich.console.monotonic"):
+        monkeypatch.setattr(clock, lambda: now)
+    with console.bar("Working") as progress:
+        for step in range(400):
+            if step == 300:
+                now += 7200
+                os.kill(os.getpid(), signal.SIGCONT)
+            progress(step / 1000, "")
+            now += 1
+    assert capsys.readouterr().err.splitlines()[-1].startswith("Working: 39 %, 0:10:")
+    assert signal.getsignal(signal.SIGCONT) == before

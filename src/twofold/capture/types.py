@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -66,6 +67,10 @@ class Frame:
         return torch.from_numpy(read_grey(self.ignored_file) > 127)
 
 
+VIDEO_LENGTH = 16
+"""Images of the video whose consistency is measured."""
+
+
 @dataclass(frozen=True)
 class Capture:
     """A person filmed: body, cameras, motion, images, splits.
@@ -107,3 +112,24 @@ def spread(items: Sequence[Item], most: int | None = None) -> list[Item]:
     count = len(items) if most is None else min(most, len(items))
     chosen = np.linspace(0, len(items) - 1, count).round().astype(int)
     return [items[i] for i in chosen.tolist()]
+
+
+def steady_video(capture: Capture, most: int = VIDEO_LENGTH) -> list[Frame]:
+    """Successive frames of one camera that stands still: the longest such run of novel poses, else of another split."""
+    best: list[Frame] = []
+    for split in ("novel_pose", "novel_view", "train"):
+        frames = sorted(capture.splits.get(split, ()), key=lambda f: (f.camera_name, f.frame_index))
+        for _, group in groupby(frames, key=lambda f: f.camera_name):
+            taken = list(group)
+            step = min(
+                (b.frame_index - a.frame_index for a, b in pairwise(taken) if b.frame_index > a.frame_index), default=0
+            )
+            run = taken[:1]
+            for before, now in pairwise(taken):
+                still = torch.equal(before.camera.world_to_camera, now.camera.world_to_camera)
+                run = [*run, now] if now.frame_index - before.frame_index == step and still else [now]
+                if len(run) > max(len(best), 1):
+                    best = run
+        if best:
+            break
+    return best[:most]

@@ -29,6 +29,7 @@ def compare(
     """
     from twofold.capture.folder import read_capture
     from twofold.comparison import common_capture, measured, pieces, require_free_for_comparison, write_comparison
+    from twofold.evaluation import require_meshes
     from twofold.training.run import choose_device, read_checkpoint, require_same
 
     within(max_images=(max_images, 1, None), max_meshes=(max_meshes, 0, None))
@@ -41,6 +42,8 @@ def compare(
     for run in runs:
         require_same(run, read, motion=True)
         read_checkpoint(run)
+    if max_meshes:
+        require_meshes(read, max_meshes)
     found = []
     with bar("Comparing") as show:
         done, whole = 0, len(runs) * (pieces(read, max_images, max_meshes) + 1)

@@ -1,11 +1,14 @@
 """Where people read: progress with an honest end, the result, and what to do next."""
 
 import os
+import signal
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from datetime import timedelta
+from types import FrameType
 from typing import final
 
 from rich.console import Console
@@ -46,6 +49,11 @@ class TimeLeft(ProgressColumn):
         while len(self._past) > 2 and self._past[1][0] <= now - max(WINDOW, (now - begun) / 2):
             self._past.popleft()
 
+    def restart(self) -> None:
+        """Measures the speed anew from here, such as after the process was stopped for a while (Ctrl-Z)."""
+        self._past.clear()
+        self.note(self._done)
+
     def seconds(self) -> float | None:
         """Seconds left; None while nobody knows."""
         if not self._past:
@@ -67,6 +75,26 @@ def console() -> Console:
 
 
 @contextmanager
+def _when_continued(restart: Callable[[], None]) -> Generator[None]:
+    """Calls a function whenever the stopped process goes on (`fg`, SIGCONT), where there is such a signal."""
+    if not hasattr(signal, "SIGCONT") or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGCONT)
+
+    def continued(number: int, frame: FrameType | None) -> None:
+        restart()
+        if callable(before):
+            before(number, frame)
+
+    signal.signal(signal.SIGCONT, continued)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGCONT, signal.SIG_DFL if before is None else before)
+
+
+@contextmanager
 def bar(title: str) -> Generator[Callable[[float, str], None], None, None]:
     """A progress bar, or a line now and then where nobody watches a terminal.
 
@@ -75,10 +103,11 @@ def bar(title: str) -> Generator[Callable[[float, str], None], None, None]:
     left = TimeLeft()
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
     out = console()
-    with Progress(
+    display = Progress(
         *columns, TimeElapsedColumn(), left, TextColumn("{task.fields[note]}"),
         console=out, refresh_per_second=4, disable=not out.is_terminal,
-    ) as display:  # fmt: skip
+    )  # fmt: skip
+    with display, _when_continued(left.restart):
         task = display.add_task(title, total=1.0, note="")
         reported, last = 0, time.monotonic()
 
