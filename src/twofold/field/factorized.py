@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from twofold.body.skeleton import PosedBody
 from twofold.config import require_within
 from twofold.field.branches import Branch, BranchNetworks, Geometry, ReadyBranch
+from twofold.field.dense_field import DenseField
 from twofold.field.encoding import encoding_size, fourier_encoding
 from twofold.field.networks import NetworkConfig, Precision
 from twofold.field.output import FieldOutput
@@ -119,7 +120,7 @@ class FactorizedFieldConfig:
         return FactorizedField(self, pose_size, generator)
 
 
-class FactorizedField(nn.Module):
+class FactorizedField(DenseField):
     """Signed distance and colour at points of canonical space, for one pose at a time."""
 
     dense = True
@@ -128,33 +129,12 @@ class FactorizedField(nn.Module):
     """Colours include the lighting."""
 
     def __init__(self, config: FactorizedFieldConfig, pose_size: int, generator: torch.Generator | None = None) -> None:
-        super().__init__()
+        super().__init__(config.gradients)
         self.config = config
         has_low, has_high = config.branches != "high", config.branches != "low"
         self.handed = has_low and has_high and config.share_features
         self.low = self._networks("low", pose_size, generator) if has_low else None
         self.high = self._networks("high", pose_size, generator) if has_high else None
-
-    def forward(
-        self,
-        x_canonical: Float[Tensor, "S 3"],
-        pose: Float[Tensor, "P"],
-        to_observation: Float[Tensor, "S 3 3"] | None = None,
-    ) -> FieldOutput:
-        """Distance, colour and gradient of the whole, and of the base branch where there is one beside it.
-
-        Args:
-            x_canonical: points, metres.
-            pose: what the pose-dependent networks are conditioned on; as released, the 69 body angles over pi.
-            to_observation: M, with the normal of observation space along M times the canonical gradient; for points
-                moved by a matrix J that is the inverse transpose of J. None leaves normals canonical.
-        """
-        matrix = to_observation if self.config.normals == "observation" else None
-        if self.config.gradients == "analytic":
-            return self._answer(x_canonical, pose, matrix)
-        with torch.enable_grad():
-            output = self._answer(_leaf(x_canonical), pose, matrix)
-        return output if torch.is_grad_enabled() else _detached(output)
 
     def sdf(self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> Float[Tensor, "S"]:
         """The distance that `forward` gives, alone; about a third of its cost."""
@@ -168,20 +148,6 @@ class FactorizedField(nn.Module):
             encoded = self._encoded(x_canonical, self.config.high_octaves)
             s2 = high.sdf(torch.cat([encoded, *handed], -1), 1)[:, 0]
         return self._shown(s1, s2, s1)
-
-    def sdf_at(self, pose: Float[Tensor, "P"]) -> Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]:
-        """`sdf` at one pose."""
-        return lambda x_canonical: self.sdf(x_canonical, pose)
-
-    def distance_and_gradient(
-        self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
-    ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
-        """The distance and its canonical gradient, both differentiable by the parameters; no colour is computed."""
-        if self.config.gradients == "analytic":
-            return self._distance_and_gradient(x_canonical, pose)
-        with torch.enable_grad():
-            sdf, gradient = self._distance_and_gradient(_leaf(x_canonical), pose)
-        return (sdf, gradient) if torch.is_grad_enabled() else (sdf.detach(), gradient.detach())
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters of the "low" and of the "high" branch, which learn at different rates; empty for one left out."""
@@ -255,7 +221,11 @@ class FactorizedField(nn.Module):
         gate = 1 / (1 + (base_sdf.detach() / self.config.gate_width) ** 4)
         return base + (gate[:, None] if base.dim() == 2 else gate) * detail
 
-    def _answer(self, x: Tensor, pose: Tensor, to_observation: Tensor | None) -> FieldOutput:
+    def answer(
+        self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"], to_observation: Float[Tensor, "S 3 3"] | None
+    ) -> FieldOutput:
+        """See `DenseField.answer`; `normals` says whether the colour networks see normals of observation space."""
+        to_observation = to_observation if self.config.normals == "observation" else None
         low, high = self.at(pose)
         base = None if low is None else self.base_branch(x, low, to_observation)
         below = None if base is None else self._output(base, None)
@@ -277,7 +247,10 @@ class FactorizedField(nn.Module):
             base=below,
         )
 
-    def _distance_and_gradient(self, x: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+    def distance_with_slope(
+        self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
+    ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
+        """See `DenseField.distance_with_slope`."""
         low, high = self.at(pose)
         base = None if low is None else self._geometry(self._encoded(x, self.config.low_octaves), None, low)
         detail = None if high is None else self._geometry(self._encoded(x, self.config.high_octaves), base, high)
@@ -296,14 +269,14 @@ class FactorizedField(nn.Module):
     def _geometry(self, encoded: Tensor, low: Geometry | None, networks: ReadyBranch) -> Geometry:
         below = low if self.handed else None
         inputs = encoded if below is None else torch.cat([encoded, below.feature], -1)
-        if self.config.gradients == "analytic":
+        if self.analytic:
             answer, tape = networks.sdf.forward_with_tape(inputs)
         else:
             answer, tape = networks.sdf(inputs), None
         return Geometry(networks.sdf, encoded, answer[:, 0], answer[:, 1:], tape, below, self.config.include_pi)
 
     def _gradient(self, x: Tensor, sdf: Tensor, by_hand: Callable[[], Tensor]) -> Tensor:
-        if self.config.gradients == "analytic":
+        if self.analytic:
             return by_hand()
         return torch.autograd.grad(sdf.sum(), x, create_graph=self.training, retain_graph=True)[0]
 
@@ -359,14 +332,3 @@ class FactorizedField(nn.Module):
         )
         pose_code = config.pose_code if posed else None
         return BranchNetworks(sdf, color, pose_code, config.feature_code if handed else None, generator)
-
-
-def _leaf(x: Tensor) -> Tensor:
-    """Points that a gradient can be taken by: themselves where they depend on something learned."""
-    return x if x.requires_grad else x.detach().requires_grad_()
-
-
-def _detached(output: FieldOutput) -> FieldOutput:
-    gradient = None if output.gradient is None else output.gradient.detach()
-    base = None if output.base is None else _detached(output.base)
-    return FieldOutput(output.sdf.detach(), output.color.detach(), gradient, base)

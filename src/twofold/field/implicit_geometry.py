@@ -1,16 +1,16 @@
 """Vid2Avatar's field: one signed distance and one colour network in canonical space, both conditioned on the pose."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from twofold.config import require_within
 from twofold.field.branches import BranchNetworks, Geometry, ReadyBranch
+from twofold.field.dense_field import DenseField
 from twofold.field.encoding import encoding_size, fourier_encoding
 from twofold.field.networks import NetworkConfig, Precision
 from twofold.field.output import FieldOutput
@@ -59,14 +59,14 @@ class ImplicitFieldConfig:
         return ImplicitField(self, pose_size, generator)
 
 
-class ImplicitField(nn.Module):
+class ImplicitField(DenseField):
     """(s, f) = SDF(encoded x, pose); c = sigmoid(RGB(x, n, P pose, f)), n the normal (Vid2Avatar Eqs. 1, 2).
 
     815,850 parameters at the default sizes. The distance starts near that of a sphere (geometric initialisation).
     """
 
     def __init__(self, config: ImplicitFieldConfig, pose_size: int, generator: torch.Generator | None = None) -> None:
-        super().__init__()
+        super().__init__(config.gradients)
         self.config = config
         encoded = encoding_size(config.octaves)
         sdf = NetworkConfig(
@@ -94,57 +94,33 @@ class ImplicitField(nn.Module):
         )
         self.networks = BranchNetworks(sdf, color, config.pose_code, None, generator)
 
-    def forward(
-        self,
-        x_canonical: Float[Tensor, "S 3"],
-        pose: Float[Tensor, "P"],
-        to_observation: Float[Tensor, "S 3 3"] | None = None,
-    ) -> FieldOutput:
-        """Distance, colour and gradient.
-
-        Args:
-            x_canonical: points, metres.
-            pose: the condition; Vid2Avatar gives the 69 body angles over pi.
-            to_observation: M, with the normal of observation space along M times the canonical gradient; for points
-                moved by a matrix J that is the inverse transpose of J. None leaves normals canonical.
-        """
-        networks = self.networks.at(pose)
-        if self.config.gradients == "analytic":
-            return self._output(networks, x_canonical, to_observation)
-        with torch.enable_grad():
-            output = self._output(networks, _leaf(x_canonical), to_observation)
-        if torch.is_grad_enabled() or output.gradient is None:
-            return output
-        return FieldOutput(output.sdf.detach(), output.color.detach(), output.gradient.detach())
-
     def sdf(self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> Float[Tensor, "S"]:
         """The distance alone, metres: about a quarter of the cost of `forward`."""
         return self.networks.sdf.at(pose)(self._encoded(x_canonical), 1)[:, 0]
 
-    def sdf_at(self, pose: Float[Tensor, "P"]) -> Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]:
-        """`sdf` at one pose."""
-        return lambda x_canonical: self.sdf(x_canonical, pose)
-
-    def distance_and_gradient(
-        self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
-    ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
-        """The distance and its canonical gradient, both differentiable by the parameters; no colour is computed."""
+    def answer(
+        self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"], to_observation: Float[Tensor, "S 3 3"] | None
+    ) -> FieldOutput:
+        """See `DenseField.answer`."""
         networks = self.networks.at(pose)
-        if self.config.gradients == "analytic":
-            geometry, gradient = self._geometry(networks, x_canonical)
-            return geometry.sdf, gradient
-        with torch.enable_grad():
-            geometry, gradient = self._geometry(networks, _leaf(x_canonical))
-        if torch.is_grad_enabled():
-            return geometry.sdf, gradient
-        return geometry.sdf.detach(), gradient.detach()
+        geometry, gradient = self._geometry(networks, x)
+        normal = gradient if to_observation is None else (to_observation * gradient[:, None]).sum(-1)
+        inputs = torch.cat([x, F.normalize(normal, dim=-1, eps=1e-6), geometry.feature], -1)
+        return FieldOutput(geometry.sdf, networks.color(inputs).sigmoid(), gradient)
+
+    def distance_with_slope(
+        self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
+    ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
+        """See `DenseField.distance_with_slope`."""
+        geometry, gradient = self._geometry(self.networks.at(pose), x)
+        return geometry.sdf, gradient
 
     def _encoded(self, x: Tensor) -> Tensor:
         return fourier_encoding(x, self.config.octaves, include_pi=False)
 
     def _geometry(self, networks: ReadyBranch, x: Tensor) -> tuple[Geometry, Tensor]:
         encoded = self._encoded(x)
-        if self.config.gradients == "analytic":
+        if self.analytic:
             output, tape = networks.sdf.forward_with_tape(encoded)
             geometry = Geometry(networks.sdf, encoded, output[:, 0], output[:, 1:], tape, None, False)
             return geometry, geometry.pull_sdf()
@@ -152,14 +128,3 @@ class ImplicitField(nn.Module):
         geometry = Geometry(networks.sdf, encoded, output[:, 0], output[:, 1:], None, None, False)
         (gradient,) = torch.autograd.grad(geometry.sdf.sum(), x, create_graph=self.training, retain_graph=True)
         return geometry, gradient
-
-    def _output(self, networks: ReadyBranch, x: Tensor, to_observation: Tensor | None) -> FieldOutput:
-        geometry, gradient = self._geometry(networks, x)
-        normal = gradient if to_observation is None else (to_observation * gradient[:, None]).sum(-1)
-        inputs = torch.cat([x, F.normalize(normal, dim=-1, eps=1e-6), geometry.feature], -1)
-        return FieldOutput(geometry.sdf, networks.color(inputs).sigmoid(), gradient)
-
-
-def _leaf(x: Tensor) -> Tensor:
-    """Points that a gradient can be taken by: themselves where they depend on something learned."""
-    return x if x.requires_grad else x.detach().requires_grad_()

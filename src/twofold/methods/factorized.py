@@ -103,10 +103,7 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The field's groups, "beta" and "pose"."""
-        pose = [p for p in self.refinement.parameters() if p.requires_grad]
-        groups = {**self.field.parameter_groups(), "beta": [self.raw_beta], "pose": pose}
-        rates = self.config.rates
-        return [self.config.pose.group(name, getattr(rates, name), group) for name, group in groups.items()]
+        return self.groups_with(self.field.parameter_groups(), self.config.rates)
 
     def row_gradients(self, collect: bool) -> dict[nn.Parameter, RowGradient]:
         """See `Avatar.row_gradients`: the tables of feature grids."""

@@ -22,7 +22,7 @@ from twofold.deform.skinning import normal_matrices, to_canonical, vertex_transf
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
 from twofold.geometry.surfaces import nearest_vertices
-from twofold.methods.base import EVALUATION, Avatar, Batch, Mode, PosedAvatar, Rendering
+from twofold.methods.base import EVALUATION, Avatar, Batch, Mode, ParameterGroup, PosedAvatar, Rendering
 from twofold.methods.completion import Completion
 from twofold.methods.loss_terms import loss_terms
 from twofold.methods.pose_schedule import condition
@@ -86,6 +86,12 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         self.completion: Completion | None = None
         if config.completion.active:
             self.completion = Completion(config.completion, given, canonical.canonical_vertices)
+
+    def groups_with(self, own: dict[str, list[nn.Parameter]], rates: object) -> list[ParameterGroup]:
+        """A method's own groups, then "beta" and "pose", each with the rate that `rates` has under its name."""
+        pose = [p for p in self.refinement.parameters() if p.requires_grad]
+        groups = own | {"beta": [self.raw_beta], "pose": pose}
+        return [self.config.pose.group(name, getattr(rates, name), group) for name, group in groups.items()]
 
     @property
     def _two_branches(self) -> bool:

@@ -162,10 +162,7 @@ class Vid2Avatar(SkinnedAvatar[Vid2AvatarConfig, ImplicitField]):
     def parameter_groups(self) -> list[ParameterGroup]:
         """The groups "networks", "scene", "beta" and "pose"."""
         scene = [] if self.scene is None else [*self.scene.parameters(), self.codes]
-        pose = [p for p in self.refinement.parameters() if p.requires_grad]
-        groups = {"networks": [*self.field.parameters()], "scene": scene, "beta": [self.raw_beta], "pose": pose}
-        rates = self.config.rates
-        return [self.config.pose.group(name, getattr(rates, name), group) for name, group in groups.items()]
+        return self.groups_with({"networks": [*self.field.parameters()], "scene": scene}, self.config.rates)
 
     def background(
         self, color: Float[Tensor, "3"], rays: int, generator: torch.Generator
