@@ -3,6 +3,7 @@ r"""Collects finished cells of `twofold reproduce` into one stored result: every
 python -m benchmarks.study reproduce/tables/ablation-studio-quick.json [--name ablation]
 python -m benchmarks.study reproduce/tables/beyond-studio-quick.json \
     --full-of reproduce/tables/ablation-studio-quick.json
+python -m benchmarks.study a/tables/main-studio-quick.json --rows-of b/tables/main-studio-quick.json c/...
 """
 
 from __future__ import annotations
@@ -22,10 +23,14 @@ METRICS = {
     "geometry": ("chamfer_cm",), "consistency": ("flow_error_mask_px",),
 }  # fmt: skip
 """What is stored of a cell."""
+PARTS = ("rows", "steps", "minutes", "printed")
+"""Of a study, by row."""
 
 
 def collect(table: dict[str, Any], cells: Path) -> dict[str, Any]:
     """Of each row every metric by "subject, seed N", the PSNR of novel poses by distance, and how it was trained.
+
+    "minutes" are the mean processor minutes of a training, where the cells know their seconds a step.
 
     Args:
         table: JSON of a table.
@@ -34,12 +39,16 @@ def collect(table: dict[str, Any], cells: Path) -> dict[str, Any]:
     rows: dict[str, dict[str, dict[str, float]]] = {}
     images: dict[str, list[dict[str, Any]]] = {}
     steps: dict[str, int] = {}
+    minutes: dict[str, list[float]] = {}
     for cell in table["cells"]:
         if cell["state"] != "done":
             continue
         found = json.loads((cells / cell["key"] / "results.json").read_text("utf-8"))
         recipe = read_cell(cells / cell["key"]).recipe
         steps[cell["row"]] = recipe.method.total_steps(recipe.training)
+        if "processor_seconds_per_step" in found.get("seconds", {}):
+            spent = found["seconds"]["processor_seconds_per_step"] * steps[cell["row"]] / 60
+            minutes.setdefault(cell["row"], []).append(spent)
         images.setdefault(cell["row"], []).extend(i for i in found["images"] if i["split"] == "novel_pose")
         for section, names in METRICS.items():
             for name in names:
@@ -52,7 +61,8 @@ def collect(table: dict[str, Any], cells: Path) -> dict[str, Any]:
         for row, own in images.items()
     }
     return {
-        "experiment": table["experiment"], "about": table["about"], "steps": steps, "rows": rows,
+        "experiment": table["experiment"], "about": table["about"], "steps": steps,
+        "minutes": {row: sum(own) / len(own) for row, own in minutes.items()}, "rows": rows,
         "extreme": {"protocol": f"PSNR over the box by {PROTOCOL}", "bins": distances},
         "cells": [cell for cell in table["cells"] if cell["state"] == "done"],
         "printed": {
@@ -75,8 +85,9 @@ def with_full_model(study: dict[str, Any], other: dict[str, Any]) -> dict[str, A
     (name,) = [row for row in other["rows"] if row in FULL]
     _require_equal(study, other, ("data", "recipe", "settings"))
     merged = dict(study)
-    for part in ("rows", "steps", "printed"):
-        merged[part] = {row: v for row, v in study[part].items() if row not in FULL} | {name: other[part][name]}
+    for part in PARTS:
+        own_rows = {row: v for row, v in study[part].items() if row not in FULL}
+        merged[part] = own_rows | {row: v for row, v in other[part].items() if row == name}
     bins = study["extreme"]["bins"] | {name: other["extreme"]["bins"][name]}
     merged["extreme"] = study["extreme"] | {"bins": bins}
     own = [cell for cell in study["cells"] if cell["row"] not in FULL]
@@ -97,7 +108,7 @@ def with_rows_of(study: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]
     _require_equal(study, other, ("data", "subjects", "size", "recipe", "settings"))
     new = [row for row in other["rows"] if row not in study["rows"]]
     merged = dict(study)
-    for part in ("rows", "steps", "printed"):
+    for part in PARTS:
         merged[part] = study[part] | {row: other[part][row] for row in new if row in other[part]}
     bins = study["extreme"]["bins"] | {row: other["extreme"]["bins"][row] for row in new}
     merged["extreme"] = study["extreme"] | {"bins": bins}
@@ -118,7 +129,7 @@ def main() -> None:
     parser.add_argument("table", type=Path)
     parser.add_argument("--name", default="")
     parser.add_argument("--full-of", type=Path, help="table whose full model is compared with")
-    parser.add_argument("--rows-of", type=Path, help="table with further rows, of other lengths")
+    parser.add_argument("--rows-of", type=Path, nargs="+", default=[], help="tables with further rows")
     arguments = parser.parse_args()
 
     def collected(file: Path) -> dict[str, Any]:
@@ -127,8 +138,8 @@ def main() -> None:
     study = collected(arguments.table)
     if arguments.full_of is not None:
         study = with_full_model(study, collected(arguments.full_of))
-    if arguments.rows_of is not None:
-        study = with_rows_of(study, collected(arguments.rows_of))
+    for table in arguments.rows_of:
+        study = with_rows_of(study, collected(table))
     store(f"study-{arguments.name or study['experiment']}", study)
 
 

@@ -73,21 +73,34 @@ def against_methods(study: Mapping[str, Any]) -> str:
     found = differences(study, *COMPARED[0][:2])
     verdicts = {verdict: [row for row, d in found.items() if d.verdict == verdict] for verdict in VERDICTS}
     parts = [f"{words} {_listed(verdicts[verdict])}" for verdict, words in VERDICTS.items() if verdicts[verdict]]
-    steps = " or ".join(f"{count:,}" for count in sorted(set(study["steps"].values())))
-    return f" Of the other methods, after {steps} steps each, it is {'; '.join(parts)} in novel poses." if parts else ""
+    if not parts:
+        return ""
+    minutes = study.get("minutes", {})
+    (own,) = [minutes.get(row) for row in study["rows"] if row in FULL]
+    spent = [minutes[row] for row in found if row in minutes]
+    if own is None or len(spent) < len(found):
+        trained = f"after {' or '.join(f'{count:,}' for count in sorted(set(study['steps'].values())))} steps each"
+    else:
+        trained = f"trained for {min(spent):.0f} to {max(spent):.0f} minutes of one core each (itself: {own:.1f})"
+    return f" Of the other methods, {trained}, it is {'; '.join(parts)} in novel poses."
 
 
 def section(study: Mapping[str, Any], table: Table) -> str:
     """A table of differences with the paper's beside them, and the PSNR by distance from the training poses."""
     columns = [entry for entry in COMPARED if differences(study, *entry[:2])]
-    head = ["Full model against", *[title for _, _, title, _ in columns]]
+    lengths = _lengths(study)
+    head = ["Full model against", *(["Training"] if lengths else []), *[title for _, _, title, _ in columns]]
     rows: list[list[str]] = []
-    for row in [row for row in study["rows"] if row not in FULL]:
-        words = [row]
+    others = [row for row in study["rows"] if row not in FULL]
+    for row in others:
+        words = [row, *([lengths[row]] if lengths else [])]
         for metric, better, _, column in columns:
             found = differences(study, metric, better).get(row)
             words.append("-" if found is None else _words(found, _papers(study, row, column)))
         rows.append(words)
+    paper = ""
+    if any(_papers(study, row, column) is not None for row in others for *_, column in columns):
+        paper = f"; in parentheses the paper's difference {_papers_subjects(study)}"
     bins = study["extreme"]["bins"]
     head_extreme = ["Row", *[f"bin {number + 1}" for number in range(max(map(len, bins.values()), default=0))]]
     extreme = [
@@ -96,11 +109,26 @@ def section(study: Mapping[str, Any], table: Table) -> str:
     ]
     return (
         f"By how much the full model is better (a negative number: worse): mean of the pairs ± their standard "
-        f"deviation, pairs won; bold where the mean exceeds two standard errors; in parentheses the paper's difference "
-        f"{_papers_subjects(study)}. {_size(study, capital=True)}.\n\n{table(head, rows)}\n"
+        f"deviation, pairs won; bold where the mean exceeds two standard errors{paper}. "
+        f"{_size(study, capital=True)}.{_full_length(lengths)}\n\n{table(head, rows)}\n"
         f"PSNR over the box in novel poses, by the distance to the nearest training pose (bins of equally many frames, "
         f"mean ± standard error over images):\n\n{table(head_extreme, extreme)}"
     )
+
+
+def _lengths(study: Mapping[str, Any]) -> dict[str, str]:
+    """Steps and processor minutes of each row's training, where rows differ in their steps; else nothing."""
+    steps, minutes = study["steps"], study.get("minutes", {})
+    if len(set(steps.values())) < 2:
+        return {}
+    return {
+        row: f"{count:,} steps" + (f", {minutes[row]:.1f} min" if row in minutes else "")
+        for row, count in steps.items()
+    }
+
+
+def _full_length(lengths: Mapping[str, str]) -> str:
+    return "".join(f" Training of the full model: {lengths[row]}." for row in FULL if row in lengths)
 
 
 def _papers_subjects(study: Mapping[str, Any]) -> str:
@@ -129,7 +157,7 @@ def _size(study: Mapping[str, Any], capital: bool = False) -> str:
     size = f" of {about['size']} x {about['size']}" if about.get("size") else ""
     text = (
         f"{subjects} held-out synthetic subject{'s' * (subjects > 1)}{size}, {seeds} seed{'s' * (seeds > 1)} each, "
-        f"recipe `{about['recipe']}` with {' or '.join(map(str, steps))} steps{settings}"
+        f"recipe `{about['recipe']}`{f' with {steps[0]} steps' if len(steps) == 1 else ''}{settings}"
     )
     return text[0].upper() + text[1:] if capital else text
 

@@ -22,10 +22,19 @@ def test_study_holds_the_numbers_of_all_finished_cells_and_nothing_of_the_others
     assert study["rows"]["w/o feat"]["novel_pose.psnr_box"] == {"studio 101, seed 0": 15.0, "studio 101, seed 1": 16.0}
     assert study["rows"]["Ours"]["novel_view.psnr_box"] == {"studio 101, seed 0": 15.0}
     assert study["steps"] == {"w/o feat": 7, "Ours": 7}
+    assert study["minutes"] == {}, "these cells do not know how long they trained"
     assert len(study["cells"]) == 3
     assert study["printed"]["Ours"]["view PSNR"] == [30.68]
     assert study["extreme"]["bins"]["w/o feat"] == [[5.0, 15.5, 0.5, 2]]
     assert study["about"] == about
+
+
+def test_study_knows_how_long_a_row_trained(tmp_path):
+    plan = planned("ablation", [StudioSource(101)], "quick", 2, ("full",), ["training.steps=120"])
+    for place, rate in zip(plan, (1.0, 2.0), strict=True):
+        store_results(store_cell(place.cell, tmp_path), seconds={"processor_seconds_per_step": rate})
+    table = json.loads(json.dumps(as_json(fill("ablation", plan, tmp_path, {}))))
+    assert collect(table, tmp_path / CELLS)["minutes"] == {"Ours": 3.0}
 
 
 def test_table_without_finished_cells_gives_an_empty_study(tmp_path):

@@ -50,6 +50,23 @@ def test_the_other_methods_are_named_by_verdict_with_their_steps():
         " Of the other methods, after 350 or 1,200 steps each, it is better than w/o {s1, c1}; worse than w/o feat"
     )
     assert against_methods(found) == expected + " in novel poses."
+    found["minutes"] = {"Ours": 1.25, "w/o {s1, c1}": 9.6, "w/o feat": 11.2}
+    assert " trained for 10 to 11 minutes of one core each (itself: 1.2), it is better" in against_methods(found)
+
+
+def test_rows_of_different_length_say_how_long_they_trained():
+    found = study(26.0, s1c1=-0.5, feat=0.25)
+    found |= {"steps": {"Ours": 350, "w/o {s1, c1}": 350, "w/o feat": 1200}, "minutes": {"Ours": 0.5, "w/o feat": 9.96}}
+    text = section(found, _table)
+    assert "| w/o feat | 1,200 steps, 10.0 min | **-0.25" in text
+    assert "| w/o {s1, c1} | 350 steps | **+0.50" in text
+    assert "recipe `quick`. Training of the full model: 350 steps, 0.5 min." in text
+
+
+def test_the_paper_is_named_only_where_it_has_a_number():
+    found = study(26.0, feat=0.25)
+    assert "the paper's difference on its subject 394" in section(found, _table)
+    assert "the paper" not in section(found | {"printed": {}}, _table)
 
 
 def test_one_pair_decides_nothing():
