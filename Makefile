@@ -19,7 +19,7 @@ export NO_MKDOCS_2_WARNING := true
 help: ## This list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
-demo: $(VENV)/.compiled ## Make a person, train an avatar, show it: demo/report.html (a few minutes)
+demo: $(VENV)/.compiled ## Generate a synthetic subject, train an avatar, show it: demo/report.html (a few minutes)
 	$(BIN)/twofold demo --out $(OUT)
 
 test: checks pytest docs ## Everything that has to hold before a change lands

@@ -10,8 +10,8 @@ import pytest
 import torch
 from command_line import refused
 
-from twofold.cli.faults import explain, is_out_of_memory, write_log
-from twofold.cli.main import main
+from twofold.cli.faults import LOWER, explain, is_out_of_memory, write_log
+from twofold.cli.main import COMMANDS, main
 
 
 def raised(error: Exception) -> Exception:
@@ -81,6 +81,11 @@ FULL = [
 @pytest.mark.parametrize("error", FULL, ids=repr)
 def test_each_way_to_run_out_of_memory_is_known(error: Exception) -> None:
     assert is_out_of_memory(error)
+
+
+def test_each_command_says_what_to_lower_where_the_memory_does_not_suffice() -> None:
+    assert set(COMMANDS) <= set(LOWER)
+    assert explain(MemoryError(), ["export", "train"]).startswith("The memory does not suffice; lower --texture")
 
 
 def test_what_numpy_and_torch_say_without_memory_is_known() -> None:

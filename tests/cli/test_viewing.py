@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from twofold.cli.main import main
+from twofold.errors import install_command
 
 
 def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -40,4 +41,4 @@ def test_without_viser_one_sentence_says_what_to_install(
     person_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
-    assert "run pip install 'twofold[viewer]'" in refusal(["view", str(person_folder)], capsys)
+    assert f"run {install_command('viewer')}" in refusal(["view", str(person_folder)], capsys)

@@ -101,7 +101,7 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
             "warning",
             "focal length",
             f"The camera sees {camera.view_angle:.3g} degrees across, which no usual lens does",
-            "Check the focal length: in pixels, of these images and not of larger ones, and not made up.",
+            "Check the focal length: in pixels, of these images and not of larger ones, and not guessed.",
             where,
         )
     if abs(np.log(camera.aspect)) > ODD_PIXELS:
@@ -125,7 +125,7 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
             "warning",
             "distance",
             f"The body stands {camera.distance:.3g} m from the camera",
-            "Check the units of translations and cameras, and whether the focal length is made up.",
+            "Check the units of translations and cameras, and whether the focal length is a guess.",
             where,
         )
 
@@ -198,7 +198,7 @@ def _masks(facts: Facts) -> Iterator[Finding]:
             "cropped",
             f"In {counted(len(cropped), 'image')} the person runs out at the {', '.join(sides)}; on average "
             f"{f'{outside:.0%}' if outside >= 0.005 else 'less than 1%'} of the body is outside",
-            "Use images that show all of the person; what is never seen is made up.",
+            "Use images that show all of the person; the colours of what is never seen are guesses.",
             places(cropped),
         )
 
@@ -210,7 +210,7 @@ def _sides_and_poses(facts: Facts) -> Iterator[Finding]:
             "warning",
             "sides unseen",
             f"Training cameras see {motion.seen:.0f} of the 360 degrees around the body, which turns by "
-            f"{motion.turned:.0f} before them; its {motion.unseen} is hardly seen and will be invented",
+            f"{motion.turned:.0f} before them; its {motion.unseen} is hardly observed, so its colours are guesses",
             "Let the person turn round, or train on more cameras.",
         )
     train = facts.images["train"]

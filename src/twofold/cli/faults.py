@@ -21,7 +21,7 @@ _OUT_OF_MEMORY = re.compile(
     re.IGNORECASE,
 )
 """How torch, CUDA and C++ say so; torch for a CPU has no class of its own for it."""
-_LOWER = {
+LOWER = {
     "train": "lower --set training.pixels.memory_gb=... and training.pixels.rays=..., then widen --set "
     "method.field.low_voxels=... and high_voxels",
     "render": "lower --chunk, then --size",
@@ -30,7 +30,14 @@ _LOWER = {
     "prepare": "make the images smaller (--max-size), or use fewer of them (--fps)",
     "studio": "lower --size or --frames",
     "demo": "close other programs",
+    "convert": "make the images smaller (--scale)",
     "import": "make the images smaller",
+    "export": "lower --texture and --faces, or close other programs",
+    "report": "lower --texture, --faces and --size, or close other programs",
+    "compare": "measure no meshes (--max-meshes 0), or close other programs",
+    "reproduce": "lower --workers, then --set training.pixels.memory_gb=...",
+    "motion": "use a shorter motion, or close other programs",
+    "view": "close other programs",
 }
 """What helps where the memory does not suffice, by command."""
 _PACKAGES = ("torch", "numpy", "scipy", "numba", "pillow", "av", "safetensors", "tyro", "mediapipe", "anny")
@@ -48,8 +55,8 @@ def explain(error: Exception, words: Sequence[str]) -> str:
         words: of the command line, without the program's name.
     """
     if is_out_of_memory(error):
-        command = next((word for word in words if word in _LOWER), "train")
-        return f"The memory does not suffice; {_LOWER[command]}."
+        command = words[0] if words else ""
+        return f"The memory does not suffice; {LOWER.get(command, 'close other programs')}."
     if isinstance(error, OSError) and error.errno in ADVICE:
         where = shown_path(os.fsdecode(error.filename)) if error.filename else "a file"
         return f"Cannot use {where}: {ADVICE[error.errno]}."

@@ -13,7 +13,7 @@ from twofold.body.joint_limits import joint_limits
 from twofold.body.motion import Motion, as_single
 from twofold.body.skeleton import JOINT_NAMES
 from twofold.capture.types import Capture
-from twofold.errors import TwofoldError
+from twofold.errors import TwofoldError, install_command
 from twofold.geometry.cameras import Camera
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.html.interactive import InteractiveCharacter, JointControl
@@ -59,7 +59,7 @@ class PageCharacter:
 def lacking(avatar: Avatar, config: BakeConfig = PAGE) -> str:
     """Why there can be no character of this avatar, in one sentence; empty where there can."""
     if missing := missing_packages(config):
-        return f"The interactive character needs {' and '.join(missing)}; run `pip install 'twofold[export]'`."
+        return f"The interactive character needs {' and '.join(missing)}; run `{install_command('export')}`."
     try:
         require_surface(avatar)
     except TwofoldError as error:

@@ -9,7 +9,7 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Any, Protocol, final, runtime_checkable
 
-from twofold.errors import TwofoldError
+from twofold.errors import TwofoldError, install_command
 from twofold.reproduce.cells import Work, in_own_process, run_cell
 
 
@@ -101,7 +101,7 @@ class SlurmExecutor:
             import submitit
         except ModuleNotFoundError:
             raise TwofoldError(
-                "--cluster needs the package submitit, which is not installed; run: pip install 'twofold[slurm]'."
+                f"--cluster needs the package submitit, which is not installed; run: {install_command('slurm')}"
             ) from None
         self.at_once, self._work = (1 if cluster == "debug" else at_once), work
         try:

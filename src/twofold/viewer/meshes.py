@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import final
 
-from twofold.errors import TwofoldError
+from twofold.errors import TwofoldError, install_command
 from twofold.outputs.export.bake_cache import BakeCache, open_cache
 from twofold.outputs.export.character import Character
 from twofold.outputs.export.make import Baked, bake
@@ -59,7 +59,7 @@ class Meshes:
         if viewed.capture is None:
             raise TwofoldError("the run's capture, whose poses the bake needs, is gone; name it with --capture.")
         if missing := missing_packages(CONFIG):
-            raise TwofoldError(f"baking needs {' and '.join(missing)}; run pip install 'twofold[export]'.")
+            raise TwofoldError(f"baking needs {' and '.join(missing)}; run {install_command('export')}.")
         require_surface(viewed.avatar)
         cache = None if viewed.run is None else open_cache(viewed.run, viewed.capture, note)
         self.baked = self._colored("full", cache, progress)

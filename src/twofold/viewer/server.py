@@ -11,7 +11,7 @@ from collections.abc import Generator
 from typing import Any
 from urllib.parse import urlsplit
 
-from twofold.errors import TwofoldError
+from twofold.errors import TwofoldError, install_command
 
 FIRST_PORT, TRIED = 8080, 50
 """Where a free port is looked for, and how many are tried."""
@@ -27,7 +27,7 @@ def require_viser() -> Any:
     try:
         return importlib.import_module("viser")
     except ImportError as error:
-        raise TwofoldError("The viewer needs the package viser; run pip install 'twofold[viewer]'.") from error
+        raise TwofoldError(f"The viewer needs the package viser; run {install_command('viewer')}.") from error
 
 
 def is_loopback(host: str) -> bool:

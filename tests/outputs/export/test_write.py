@@ -172,7 +172,7 @@ def test_what_cannot_be_written_is_refused_before_baking(avatar, person, tmp_pat
 def test_missing_package_is_named_before_baking(avatar, person, tmp_path, monkeypatch) -> None:
     found = write.importlib.util.find_spec
     monkeypatch.setattr(write.importlib.util, "find_spec", lambda name: None if name == "xatlas" else found(name))
-    with pytest.raises(TwofoldError, match=r"needs xatlas; run pip install 'twofold\[export\]'"):
+    with pytest.raises(TwofoldError, match=r"needs xatlas; run pip install .*\[export\]"):
         export(avatar, person, tmp_path / "exports", ExportRequest(config=SMALL))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 
-from twofold.errors import TwofoldError
+from twofold.errors import TwofoldError, install_command
 from twofold.outputs.export.atlas_kernels import paint
 from twofold.outputs.export.lattice import TriangleLattice
 
@@ -41,7 +41,7 @@ def unwrap(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], si
         xatlas: Any = importlib.import_module("xatlas")
     except ImportError as error:
         raise TwofoldError(
-            "A texture needs the package xatlas, which is not installed; run pip install 'twofold[export]', or give "
+            f"A texture needs the package xatlas, which is not installed; run {install_command('export')}, or give "
             "--vertex-colors."
         ) from error
     atlas = xatlas.Atlas()

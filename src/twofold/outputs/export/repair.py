@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from scipy import ndimage, sparse
 from torch import Tensor
 
-from twofold.errors import TwofoldError
+from twofold.errors import TwofoldError, install_command
 from twofold.geometry.surfaces import nearest_vertices, sample_surface
 
 SAME = 2e-6
@@ -114,7 +114,7 @@ def decimate(
     except ImportError as error:
         raise TwofoldError(
             "Reducing a mesh needs the package fast-simplification, which is not installed; "
-            "run pip install 'twofold[export]'."
+            f"run {install_command('export')}."
         ) from error
     points, triangles = simplify(vertices.astype(np.float32), faces.astype(np.int32), target_count=target)
     return repair(points.astype(np.float32), triangles.astype(np.int64))

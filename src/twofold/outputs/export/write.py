@@ -12,7 +12,7 @@ import torch
 from twofold.body.motion import Motion
 from twofold.capture.coverage import coverage_of
 from twofold.capture.types import Capture
-from twofold.errors import TwofoldError
+from twofold.errors import TwofoldError, install_command
 from twofold.files import plain_errors, write_json
 from twofold.methods.base import Avatar
 from twofold.outputs.export.animations import WEIGHED, capture_clip, grounded, motion_clip, turned, upright
@@ -86,7 +86,7 @@ def require_packages(config: BakeConfig) -> None:
         TwofoldError: names those that are missing.
     """
     if missing := missing_packages(config):
-        raise TwofoldError(f"Baking a mesh needs {' and '.join(missing)}; run pip install 'twofold[export]'.")
+        raise TwofoldError(f"Baking a mesh needs {' and '.join(missing)}; run {install_command('export')}.")
 
 
 def missing_packages(config: BakeConfig) -> list[str]:

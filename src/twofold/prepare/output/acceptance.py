@@ -210,8 +210,8 @@ def warnings_about(
     words: list[str] = []
     if yaw < FULL_TURN:
         words.append(
-            f"The body turns through only {yaw:.0f} degrees before the training camera; unseen sides are made up. "
-            "Film a full turn for a back that is true."
+            f"The body turns through only {yaw:.0f} degrees before the training camera; the colours of unseen sides "
+            "are guesses. Film a full turn for a back that is true."
         )
     if moved is not None and moved > MOVING * width and not several:
         words.append(
