@@ -7,6 +7,7 @@ import os
 import platform
 import resource
 import statistics
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -40,8 +41,18 @@ def machine() -> dict[str, object]:
     }
 
 
+def commit() -> str | None:
+    """The commit that runs, with a plus where sources were changed since; None outside of a clone."""
+    try:
+        words = ("describe", "--always", "--abbrev=7", "--exclude=*", "--dirty=+")
+        found = subprocess.run(("git", *words), cwd=RESULTS.parent, capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip() or None
+
+
 def studio_capture(size: int, frames: int = 10, cameras: int = 2, seed: int = 0) -> Capture:
-    """A made capture, kept in the temporary folder between benchmarks."""
+    """A synthetic capture, kept in the temporary folder between benchmarks."""
     folder = Path("/tmp") / f"twofold-benchmark-{size}-{frames}-{cameras}-{seed}"
     if not folder.exists():
         make_studio(StudioConfig(seed=seed, size=size, frames=frames, cameras=cameras), folder)
@@ -69,8 +80,8 @@ def peak_memory_gb() -> float:
 
 
 def store(name: str, result: dict[str, object]) -> None:
-    """Writes benchmarks/results/NAME.json and prints it."""
+    """Writes benchmarks/results/NAME.json, with the machine and the commit, and prints it."""
     RESULTS.mkdir(exist_ok=True)
-    text = json.dumps({"machine": machine(), **result}, indent=2)
+    text = json.dumps({"machine": machine(), "commit": commit(), **result}, indent=2)
     (RESULTS / f"{name}.json").write_text(text + "\n", encoding="utf-8")
     print(text)

@@ -19,9 +19,12 @@ def side_by_side(result: dict[str, Any], table: Table) -> str:
     """A line for each run of a stored comparison, and how it was made."""
     splits = [split for split in ("novel_view", "novel_pose") if split in result["rows"][0]]
     titles = {"novel_view": "Novel view: box PSNR, SSIM, IoU", "novel_pose": "Novel pose: box PSNR, SSIM, IoU"}
+    changed = [row for row in result["rows"] if row["settings"]]
+    marks = {id(row): f" ({number + 1})" for number, row in enumerate(changed)}
     rows = [
         (
-            f"`{row['recipe']}`", _steps(row), f"{row['cost']['training_processor_seconds']:.0f}",
+            f"`{row['recipe']}`{marks.get(id(row), '')}", _steps(row),
+            f"{row['cost']['training_processor_seconds']:.0f}",
             *(
                 f"{row[split]['psnr_box']:.1f} dB, {row[split]['ssim_box']:.3f}, {row[split]['silhouette_iou']:.3f}"
                 for split in splits
@@ -38,10 +41,12 @@ def side_by_side(result: dict[str, Any], table: Table) -> str:
         "An image, processor s",
         "Parameters stored",
     )
-    changed = "; ".join(f"`{r['recipe']}` with {', '.join(r['settings'])}" for r in result["rows"] if r["settings"])
     note = f"{result['capture']}. {result['frames'][:1].upper()}{result['frames'][1:]}."
     if changed:
-        note += f" Trained with other settings than the recipe has now: {changed}."
+        settings = "; ".join(
+            f"{marks[id(row)].strip()} {', '.join(f'`{s}`' for s in row['settings'])}" for row in changed
+        )
+        note += f" Trained with other settings than the recipe has now: {settings}."
     return f"{table(head, rows)}\n{note}\n"
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,31 +56,33 @@ def load(folder: Path = RESULTS) -> dict[str, Any]:
 
 def results_page(results: dict[str, Any]) -> str:
     """The page, Markdown."""
-    machines = "; ".join(sorted(set(map(_machine, _benchmarks(results)))))
     study, main_study = results.get("study-ablation"), results.get("study-main")
     others = against_methods(main_study) if main_study else ""
     parts = [
         "# Results\n\n"
         + (f"{answer(study)}{others}\n\n" if study else "")
         + "Made from the JSON files in `benchmarks/results/` by `python -m benchmarks.results_page`. All "
-        f"numbers are from CPUs: {machines}.\n",
+        "numbers are from CPUs with two cores and AVX-512; each section names the processor and the commit. Numbers in "
+        "dB are PSNR over the bounding box of the person's true mask (the box).\n",
         f"## Avatars and fits\n\n{_captures(results['captures'])}",
         *_studies(results),
-        *([variants_section.section(results["variants"], _table)] if "variants" in results else []),
-        *([_camera_colors(results["camera-colors"])] if "camera-colors" in results else []),
+        *_single(results, "variants", lambda result: variants_section.section(result, _table)),
+        *_single(results, "camera-colors", _camera_colors),
         "## Training step\n\nSame networks, rays and losses. `fast` has the paper's network sizes, the shell sampler, "
         "a hand-written reverse pass and bfloat16 hidden layers; the reference form is the usual one: error-bounded "
-        "sampler, autograd through autograd, dense samples, float32. On the AMD EPYC, before the "
-        "compiled loops were last changed. `python -m benchmarks.step`.\n\n" + _steps(_named(results, "step-")),
+        f"sampler, autograd through autograd, dense samples, float32. {_when(_named(results, 'step-').values())} "
+        "`python -m benchmarks.step`.\n\n" + _steps(_named(results, "step-")),
         "## Training step of the other methods\n\nThe fast recipe against the form of the authors' program (every "
         "sample shaded, float32, gradients by automatic differentiation): same networks, weights and rays. Seconds of "
-        "the processor on one thread, measured beside other programs, before the fast recipes were last changed. "
-        "`python -m benchmarks.method_steps`.\n\n" + _method_steps(results["method-steps-cpu-1threads"]),
+        "the processor on one thread, measured beside other programs. "
+        f"{_when([results['method-steps-cpu-1threads']])} `python -m benchmarks.method_steps`.\n\n"
+        + _method_steps(results["method-steps-cpu-1threads"]),
         *_methods(results),
-        "## Rendering\n\nSeconds for one image, posing included. On the AMD EPYC, before the compiled "
-        "loops were last changed. `python -m benchmarks.rendering`.\n\n" + _rendering(_named(results, "rendering-")),
-        "## Quality against time\n\nSynthetic subject, one training camera; PSNR over the subject's box. "
-        "`python -m benchmarks.quality`.\n\n" + _quality(_named(results, "quality-")),
+        f"## Rendering\n\nSeconds for one image, posing included. {_when(_named(results, 'rendering-').values())} "
+        "`python -m benchmarks.rendering`.\n\n" + _rendering(_named(results, "rendering-")),
+        "## Quality against time\n\nSynthetic subject, one training camera. "
+        f"{_when(_named(results, 'quality-').values())} `python -m benchmarks.quality`.\n\n"
+        + _quality(_named(results, "quality-")),
         *sharpness_section.section(results, _table),
         *_completions(_named(results, "completion-", "")),
         PICTURES,
@@ -103,12 +105,12 @@ def readme_table(results: dict[str, Any]) -> str:
                 rows["The balancing man, poses and masks prepared elsewhere"],
             ),
             (
-                "Training step, the paper's network sizes, 1,728 rays (before the loops were last changed)",
+                "Training step, the paper's network sizes, 1,728 rays",
                 f"{_s(two['fast'])}, {_ratio(two):.0f} times faster than the reference form ({_s(two['reference'])}); "
                 f"on one core {_s(one['fast'])}, {_ratio(one):.0f} times",
             ),
             (
-                "Image of 512 x 512 (before the loops were last changed)",
+                "Image of 512 x 512",
                 f"recipe `quick` {_s(image['quick']['512'])}, the paper's networks {_s(image['fast']['512'])}; "
                 f"on one core {_s(picture_one['quick']['512'])} and {_s(picture_one['fast']['512'])}",
             ),
@@ -151,8 +153,9 @@ def _named(results: dict[str, Any], prefix: str, part: str = "cpu") -> dict[str,
     return {name: result for name, result in results.items() if name.startswith(prefix) and part in name}
 
 
-def _benchmarks(results: dict[str, Any]) -> list[dict[str, Any]]:
-    return [result for prefix in ("step-", "rendering-", "quality-") for result in _named(results, prefix).values()]
+def _single(results: dict[str, Any], name: str, shown: Callable[[dict[str, Any]], str]) -> list[str]:
+    """The section of one result, and when it was measured."""
+    return [f"{shown(results[name]).rstrip()}\n\n{_when([results[name]])}\n"] if name in results else []
 
 
 def _studies(results: dict[str, Any]) -> list[str]:
@@ -164,8 +167,7 @@ def _studies(results: dict[str, Any]) -> list[str]:
         "study-main": "## The full model and the methods that the paper compares with",
     }
     return [
-        f"{titles.get(name, f'## Study {name[6:]}')}\n\n{section(study, _table)}"
-        + (f"\n{study['note']}\n" if "note" in study else "")
+        f"{titles.get(name, f'## Study {name[6:]}')}\n\n{section(study, _table)}" + f"\n{_when([study])}\n"
         for name, study in results.items()
         if name.startswith("study-")
     ]
@@ -176,21 +178,25 @@ def _methods(results: dict[str, Any]) -> list[str]:
     return [
         f"## Methods side by side: {heading[0].lower()}{heading[1:]}\n\nTrained by their fast recipes for minutes of "
         "one thread, without LPIPS, while other programs ran; [images](methods/index.md#side-by-side). "
-        "`twofold compare`.\n\n" + side_by_side(results[f"methods-{name}"], _table)
+        f"`twofold compare`.\n\n{side_by_side(results[f'methods-{name}'], _table)}\n"
+        f"{_when([results[f'methods-{name}']])}\n"
         for name, heading in METHODS.items()
         if f"methods-{name}" in results
     ]
 
 
-def _machine(result: dict[str, Any]) -> str:
-    machine = result["machine"]
-    extra = " with AVX-512" if machine["avx512"] else ""
-    return f"{machine['processor']}, {machine['cores']} cores{extra}, torch {machine['torch']}"
+def _when(results: Iterable[dict[str, Any]]) -> str:
+    """At which commits and on which processors results were measured, a sentence."""
+    many = list(results)
+    commits = sorted({str(result["commit"]) for result in many})
+    processors = sorted({str(result["machine"]["processor"]) for result in many})
+    return f"Commit{'s' * (len(commits) > 1)} {' and '.join(commits)}, {' and '.join(processors)}."
 
 
 def _captures(captures: dict[str, Any]) -> str:
     rows = [(row["subject"], row["result"], f"`{row['command']}`: {row['how']}") for row in captures["rows"]]
-    return _table(("What", "Result", "How"), rows)
+    text = captures["what"]
+    return f"{_table(('What', 'Result', 'How'), rows)}\n{text[:1].upper()}{text[1:]}.\n"
 
 
 def _steps(results: dict[str, Any]) -> str:
@@ -289,7 +295,7 @@ def _completions(results: dict[str, Any]) -> list[str]:
         "that show what no training image shows, and of those that show what one does; PSNR over the person in "
         "training images. `python -m benchmarks.completion`.\n\n"
     )
-    return [text + _table(head, rows)] if rows else []
+    return [f"{text}{_table(head, rows)}\n{_when(results.values())}\n"] if rows else []
 
 
 def _ratio(result: dict[str, Any]) -> float:

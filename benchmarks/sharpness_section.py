@@ -32,11 +32,12 @@ def section(results: Mapping[str, Any], table: Table) -> list[str]:
     text = (
         f"`studio --size {after['size']}`, recipe `quick`, one thread: {before['steps']} steps of the code before "
         f"({_seconds(before, shared)} processor seconds a subject) and {after['steps']} steps of the code after "
-        f"([sharpness](sharpness.md); {_seconds(after, shared)}). PSNR over the subject's box, dB, and gradient error. "
+        f"([sharpness](sharpness.md); {_seconds(after, shared)}). PSNR over the box, dB, and gradient error. "
         f"In novel views {mean(g for g, _ in gains):+.2f} dB and {100 * mean(g for _, g in gains):.0f} % less gradient "
         "error on average. `python -m benchmarks.sharpness`."
     )
-    return [f"## Sharpness\n\n{text}\n\n" + table(("Subject", "Images", "Before", "After"), rows)]
+    when = f"Before: commit {before['commit']}; after: commit {after['commit']}; {after['machine']['processor']}."
+    return [f"## Sharpness\n\n{text}\n\n{table(('Subject', 'Images', 'Before', 'After'), rows)}\n{when}\n"]
 
 
 def _both(found: Mapping[str, float]) -> str:

@@ -21,13 +21,14 @@ def section(result: Mapping[str, Any], table: Table) -> str:
             gains.append(_gain(differences) if name != result["against"] else "")
         rows.append((f"`{name}`", str(len(subjects)), *means, *gains))
     text = (
-        f"Subjects that no other table reports, one training each: {result['steps']} steps, {result['images']} images "
-        f"of each split, PSNR over the box, dB. Then the difference to `{result['against']}` on the same subjects: "
-        "mean ± standard deviation, subjects that gain. With fewer numbers of the pose the fine networks overfit less; "
-        "2 became the default, chosen on these subjects. `python -m benchmarks.variants`."
+        "`method.field.pose_code` is how many values the pose is reduced to before the pose-dependent branch. "
+        f"Synthetic subjects that occur in no other table, one training of {result['steps']} steps each, dB over the "
+        f"box, {result['images']} images of each split. Gain: the difference to `{result['against']}` on the same "
+        "subjects, mean ± standard deviation, and how many subjects gain. With fewer values the pose-dependent branch "
+        "overfits less; 2 became the default, chosen on these subjects. `python -m benchmarks.variants`."
     )
     head = ("Variant", "Subjects", *SPLITS.values(), *(f"{name}, gain" for name in SPLITS.values()))
-    return f"## Numbers of the pose\n\n{text}\n\n" + table(head, rows)
+    return f"## Size of the pose code\n\n{text}\n\n" + table(head, rows)
 
 
 def _gain(differences: Sequence[float]) -> str:

@@ -120,7 +120,7 @@ def measure_split(
     protocol = {
         **image_metrics.PROTOCOLS,
         "frames": f"mean over {sampled(len(frames), len(capture.splits[split]), 'images')} of the split {split}: "
-        f"{times} frames, {cameras} cameras",
+        f"{times} frame{'s' * (times > 1)}, {cameras} camera{'s' * (cameras > 1)}",
         "poses": poses,
         "background": f"constant {capture.background}",
     }

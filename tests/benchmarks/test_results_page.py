@@ -66,3 +66,19 @@ def test_a_readme_without_marks_is_not_lost() -> None:
 @pytest.mark.parametrize("text", ["docs/responsible-use.md", "docs/results.md", "LICENSE", "arxiv.org/abs/2406.00637"])
 def test_readme_links_what_a_reader_needs(text: str) -> None:
     assert text in README.read_text("utf-8")
+
+
+def test_each_stored_result_says_on_what_and_at_which_commit_it_was_measured() -> None:
+    for name, result in load().items():
+        if name != "captures":
+            assert re.fullmatch("[0-9a-f]{7,}", result["commit"]), name
+            assert result["machine"]["processor"], name
+
+
+def test_pages_name_commits_and_processors() -> None:
+    results = copy.deepcopy(load())
+    for result in (results["step-cpu-1threads"], results["step-cpu-2threads"]):
+        result |= {"commit": "abc1234", "machine": {"processor": "Made Up 9"}}
+    assert "float32. Commit abc1234, Made Up 9. `python -m benchmarks.step`" in results_page(results)
+    results["step-cpu-2threads"]["commit"] = "def5678"
+    assert "Commits abc1234 and def5678, Made Up 9." in results_page(results)

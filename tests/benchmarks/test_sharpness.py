@@ -10,7 +10,9 @@ from benchmarks import sharpness, sharpness_section
 def run(psnr, error, steps):
     split = {"psnr_box": psnr, "gradient_error": error}
     subject = {"processor_seconds": 100.0, "novel_view": split, "novel_pose": split, "train": split}
-    return {"steps": steps, "size": 512, "subjects": {"3": subject, "4": subject}}
+    machine = {"processor": "a processor"}
+    subjects = {"3": subject, "4": subject}
+    return {"machine": machine, "commit": f"c{steps}", "steps": steps, "size": 512, "subjects": subjects}
 
 
 def table(head, rows):
@@ -21,6 +23,7 @@ def test_section_says_what_was_gained():
     results = {"sharpness-before": run(23.0, 0.3, 40), "sharpness-quick": run(24.5, 0.24, 30)}
     (text,) = sharpness_section.section(results, table)
     assert "40 steps of the code before (100 processor seconds a subject)" in text
+    assert text.endswith("Before: commit c40; after: commit c30; a processor.\n")
     assert "+1.50 dB and 20 % less gradient error" in text
     assert "seed 4|Novel poses|23.00, 0.300|24.50, 0.240" in text
 
