@@ -43,12 +43,16 @@ def machine() -> dict[str, object]:
 
 def commit() -> str | None:
     """The commit that runs, with a plus where sources were changed since; None outside of a clone."""
+
+    def told(*words: str) -> str:
+        call = subprocess.run(("git", *words), cwd=RESULTS.parents[1], capture_output=True, text=True, timeout=10)
+        return call.stdout.strip()
+
     try:
-        words = ("describe", "--always", "--abbrev=7", "--exclude=*", "--dirty=+")
-        found = subprocess.run(("git", *words), cwd=RESULTS.parent, capture_output=True, text=True, timeout=10)
+        head = told("rev-parse", "--short=7", "HEAD")
+        return head + "+" * bool(told("status", "--porcelain", "--", "src")) if head else None
     except (OSError, subprocess.SubprocessError):
         return None
-    return found.stdout.strip() or None
 
 
 def studio_capture(size: int, frames: int = 10, cameras: int = 2, seed: int = 0) -> Capture:
