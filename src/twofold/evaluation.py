@@ -227,7 +227,7 @@ def measure_consistency(
     figures: dict[str, object] = dict(video_metrics.frame_consistency(rendered()))
     if not figures:
         return {}
-    seconds = (frames[1].frame_index - frames[0].frame_index) / capture.fps
+    seconds = float(np.diff(capture.seconds_of([frame.frame_index for frame in frames])).mean())
     told = f"{len(frames)} successive frames of the camera {frames[0].camera_name}, {seconds:.3g} s apart"
     return figures | {"protocol": {**video_metrics.PROTOCOLS, "frames": told}}
 

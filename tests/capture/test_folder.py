@@ -109,6 +109,14 @@ def test_true_motion_is_kept_beside_a_disturbed_one(tmp_path, tiny):
     assert torch.equal(truth[1], translations)
 
 
+def test_times_of_frames_are_kept_where_the_rate_varies(tmp_path, tiny):
+    assert read_capture(tiny).seconds is None
+    assert read_capture(tiny).seconds_of([0, 3]).tolist() == [0.0, 3 / read_capture(tiny).fps]
+    seconds = torch.tensor([0.0, 0.1, 0.2, 0.7, 0.8, 1 / 3 + 1], dtype=torch.float64)
+    write_tiny(tmp_path / "uneven", seconds=seconds)
+    assert read_capture(tmp_path / "uneven").seconds_of([3, 5]).tolist() == [0.7, 1 / 3 + 1]
+
+
 def test_notes_are_kept_and_disturb_nothing(tmp_path):
     write_tiny(tmp_path / "a", notes={"left_out": [7, 8]})
     assert json.loads((tmp_path / "a" / "capture.json").read_text())["notes"] == {"left_out": [7, 8]}

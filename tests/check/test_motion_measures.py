@@ -22,12 +22,13 @@ from twofold.prepare.turning import SEEN_FROM, arc, sides_seen
 def facts(turner_read, turner_shaped):
     """A function that measures poses and translations, the filmed ones unless given."""
 
-    def measure(poses=None, translations=None, splits=None, fps=FPS):
+    def measure(poses=None, translations=None, splits=None, fps=FPS, seconds=None):
         given_poses, given_translations = motion()
+        taken = np.arange(MOMENTS) / fps if seconds is None else seconds
         return motion_facts(
             given_poses if poses is None else poses,
             given_translations if translations is None else translations,
-            turner_shaped.joints, splits or turner_read.splits, fps,
+            turner_shaped.joints, splits or turner_read.splits, taken,
         )  # fmt: skip
 
     return measure
@@ -150,3 +151,11 @@ def test_novelty_is_how_far_test_poses_are_from_all_training_poses(facts):
     assert facts(poses).novelty == pytest.approx(0, abs=0.1)
     poses[20:, 18, 1] += math.radians(50)
     assert 20 < facts(poses).novelty < 51
+
+
+def test_a_frame_that_was_taken_late_may_be_far_from_the_one_before(facts):
+    poses, translations = motion()
+    pause = MOMENTS // 2
+    moved = translations + 0.8 * (torch.arange(MOMENTS) >= pause)[:, None] * torch.tensor([1.0, 0, 0])
+    assert pause in facts(poses, moved).jumps
+    assert facts(poses, moved, seconds=np.arange(MOMENTS) / FPS + 2.0 * (np.arange(MOMENTS) >= pause)).jumps == ()

@@ -89,6 +89,21 @@ def test_the_world_is_turned_but_no_image_changes(tmp_path, monkeypatch):
     assert np.array_equal((255 * frame.mask().numpy()).round(), cleaned)
 
 
+@pytest.mark.parametrize("uneven", [False, True])
+def test_frames_of_a_varying_rate_keep_their_times(tmp_path, monkeypatch, uneven):
+    seconds = np.arange(14) / FPS + 0.3 * uneven * (np.arange(14) >= 6)
+    watch = pipeline.watch_clip
+    monkeypatch.setattr(
+        pipeline, "watch_clip", lambda *g, **n: replace(watch(*g, **n), seconds=tuple(seconds.tolist()))
+    )
+    stage = Stage(tmp_path / "clips")
+    stage.is_understood(monkeypatch)
+    stage.prepare(tmp_path / "me")
+    capture = read_capture(tmp_path / "me")
+    assert (capture.seconds is not None) == uneven
+    np.testing.assert_allclose(capture.seconds_of(range(14)), seconds)
+
+
 @pytest.mark.parametrize(("every", "held_out"), [(10, [5, 15]), (3, [1, 4, 7, 10, 13, 16, 19, 22])])
 def test_every_tenth_frame_is_held_out_between_two_that_train(tmp_path, monkeypatch, every, held_out):
     stage = Stage(tmp_path / "clips", 24)

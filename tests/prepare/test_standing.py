@@ -15,7 +15,7 @@ def measured(poses=None, translations=None, fps=10.0, frames=20, counted=None):
     joints = shape_body(body, torch.zeros(body.shape_basis.shape[-1])).joints
     poses = torch.zeros(frames, 24, 3) if poses is None else poses
     translations = torch.zeros(frames, 3) if translations is None else translations
-    return standing_facts(poses, translations, joints, fps, counted)
+    return standing_facts(poses, translations, joints, np.arange(len(poses)) / fps, counted)
 
 
 def topics(facts):

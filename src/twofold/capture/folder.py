@@ -80,7 +80,8 @@ def capture_of(contents: Contents) -> Capture:
     }
     meshes = numbered_files(folder / MESHES, (".npz",))
     return Capture(
-        contents.name, folder, body, betas, contents.fps, contents.background, splits, meshes, contents.credit
+        contents.name, folder, body, betas, contents.fps, contents.background, splits, meshes, contents.credit,
+        contents.seconds,
     )  # fmt: skip
 
 
@@ -182,6 +183,7 @@ class CaptureWriter:
         credit: str = "",
         true_poses: Float[Tensor, "T 24 3"] | None = None,
         true_translations: Float[Tensor, "T 3"] | None = None,
+        seconds: Float[Tensor, "T"] | None = None,
         notes: Mapping[str, Any] | None = None,
         thorough: bool = False,
     ) -> None:
@@ -200,6 +202,7 @@ class CaptureWriter:
             credit: whom to name when showing it.
             true_poses: where `poses` were disturbed, what they were.
             true_translations: likewise.
+            seconds: when each frame was taken, where the rate varies.
             notes: anything worth keeping about how it was made (numbers, texts, lists); nothing reads it.
             thorough: also judges the pixels of every image, for images that nobody has looked at yet.
 
@@ -209,7 +212,7 @@ class CaptureWriter:
         folder = self._open()
         motion = {
             "poses": poses, "translations": translations, "betas": betas,
-            "true_poses": true_poses, "true_translations": true_translations,
+            "true_poses": true_poses, "true_translations": true_translations, "seconds": seconds,
         }  # fmt: skip
         write_npz(folder / BODY, body.arrays())
         write_npz(folder / MOTION, {key: value.cpu().numpy() for key, value in motion.items() if value is not None})

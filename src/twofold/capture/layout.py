@@ -56,6 +56,7 @@ class Contents:
         betas: its shape coefficients.
         poses: axis-angle, radians, one frame a row.
         translations: metres.
+        seconds: when each frame was taken, where the rate varies.
     """
 
     folder: Path
@@ -69,6 +70,7 @@ class Contents:
     betas: Float[Tensor, "S"] | None
     poses: Float[Tensor, "T 24 3"] | None
     translations: Float[Tensor, "T 3"] | None
+    seconds: Float[Tensor, "T"] | None
 
     @property
     def images(self) -> dict[str, list[int]]:
@@ -152,13 +154,13 @@ def read_contents(folder: Path) -> tuple[Contents, list[str]]:
         )
     faults: list[str] = []
     body = _read_body(folder, faults)
-    betas, poses, translations = _read_motion(folder, body, faults)
+    betas, poses, translations, seconds = _read_motion(folder, body, faults)
     cameras = _cameras(description.get("cameras"), faults)
     known = set(description["cameras"]) if isinstance(description.get("cameras"), dict) else set[str]()
     splits = _splits(description.get("splits"), known, None if poses is None else len(poses), faults)
     name, fps, background, credit = _titles(description, faults)
     contents = Contents(
-        folder, name, fps, background, credit, cameras, splits, body, betas, poses, translations
+        folder, name, fps, background, credit, cameras, splits, body, betas, poses, translations, seconds
     )  # fmt: skip
     return contents, faults
 
@@ -318,22 +320,22 @@ def _read_body(folder: Path, faults: list[str]) -> Body | None:
 
 def _read_motion(
     folder: Path, body: Body | None, faults: list[str]
-) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    names = ("betas", "poses", "translations", "true_poses", "true_translations")
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    names = ("betas", "poses", "translations", "true_poses", "true_translations", "seconds")
     try:
         arrays = read_npz(folder / MOTION, names)
     except TwofoldError as error:
         faults.append(within_folder(folder, error))
-        return None, None, None
+        return None, None, None, None
     moments = len(arrays["poses"]) if "poses" in arrays and arrays["poses"].ndim else 0
     shapes: dict[str, tuple[int | None, ...]] = {
         "betas": (None,), "poses": (moments, 24, 3), "translations": (moments, 3),
-        "true_poses": (moments, 24, 3), "true_translations": (moments, 3),
+        "true_poses": (moments, 24, 3), "true_translations": (moments, 3), "seconds": (moments,),
     }  # fmt: skip
     read: dict[str, Tensor] = {}
     for name, shape in shapes.items():
         if name not in arrays:
-            if not name.startswith("true_"):
+            if not name.startswith("true_") and name != "seconds":
                 faults.append(f"{MOTION} lacks {name}.")
             continue
         array, words = arrays[name], " x ".join("any" if n is None else str(n) for n in shape)
@@ -348,8 +350,12 @@ def _read_motion(
         elif name.endswith("poses") and (turns := np.linalg.norm(array, axis=-1)).size and turns.max() > 4 * np.pi:
             bad = np.flatnonzero((turns > 4 * np.pi).any(-1)).tolist()
             faults.append(f"{MOTION}: {name} turns joints by more than two turns at times {spans(bad)}; give radians.")
+        elif name == "seconds" and (back := np.flatnonzero(np.diff(array) <= 0) + 1).size:
+            faults.append(
+                f"{MOTION}: seconds should increase from frame to frame; not so at times {spans(back.tolist())}."
+            )
         else:
-            read[name] = torch.as_tensor(array.astype(np.float32))
+            read[name] = torch.as_tensor(array.astype(np.float64 if name == "seconds" else np.float32))
     betas = read.get("betas")
     if body is not None and betas is not None and len(betas) > body.shape_basis.shape[-1]:
         faults.append(f"{MOTION}: there are {len(betas)} betas, the body takes {body.shape_basis.shape[-1]} at most.")
@@ -357,7 +363,7 @@ def _read_motion(
     elif body is not None and betas is not None and (size := size_fault(shape_body(body, betas).vertices.numpy())):
         faults.append(f"{MOTION}: betas {size}; take those that were fitted to this body.")
         betas = None
-    return betas, read.get("poses"), read.get("translations")
+    return betas, read.get("poses"), read.get("translations"), read.get("seconds")
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:

@@ -85,6 +85,7 @@ class Capture:
         splits: frames of "train", "novel_view" and "novel_pose" (the last two may be empty).
         meshes: true posed surfaces by time (npz with vertices in metres and faces), where they are known.
         credit: whom to name when showing it; empty for one's own.
+        seconds: when each frame of the motion was taken, where the rate varies; `fps` is the mean then.
     """
 
     name: str
@@ -96,6 +97,13 @@ class Capture:
     splits: dict[str, tuple[Frame, ...]]
     meshes: dict[int, Path] = field(default_factory=dict)
     credit: str = ""
+    seconds: Float[Tensor, "T"] | None = None
+
+    def seconds_of(self, frames: Sequence[int]) -> Float[np.ndarray, "n"]:
+        """When frames were taken, seconds, by their indices."""
+        if self.seconds is None:
+            return np.array(frames, dtype=np.float64) / self.fps
+        return self.seconds[list(frames)].numpy().astype(np.float64)
 
     @property
     def train(self) -> tuple[Frame, ...]:

@@ -179,7 +179,8 @@ def measure_capture(
     by_camera = _grouped(frame for _, frame in chosen)
     training = [name for name in by_camera if any(f.camera_name == name for f in capture.train)]
     backs = spread([frame for _, frame in chosen if shows_its_back(frame, shaped)], BACKS)
-    motion = motion_facts(poses, translations, shaped.joints, capture.splits, capture.fps)
+    seconds = capture.seconds_of(range(len(poses)))
+    motion = motion_facts(poses, translations, shaped.joints, capture.splits, seconds)
     facts = Facts(
         name=capture.name,
         folder=folder,
@@ -191,7 +192,7 @@ def measure_capture(
         frames=tuple(looked),
         cameras=_cameras(contents, looked, by_camera, shaped),
         motion=motion,
-        standing=standing_facts(poses, translations, shaped.joints, capture.fps, motion.frames),
+        standing=standing_facts(poses, translations, shaped.joints, seconds, motion.frames),
         backgrounds={name: background_of(spread(by_camera[name], BACKGROUNDS)) for name in training[:4]},
         backs=tuple((f.camera_name, f.frame_index) for f in backs),
         faces=tuple((f.camera_name, f.frame_index) for f in backs if sees_a_face(f, shaped)),

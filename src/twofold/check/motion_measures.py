@@ -73,7 +73,7 @@ def motion_facts(
     translations: Float[Tensor, "T 3"],
     joints: Float[Tensor, "24 3"],
     splits: dict[str, tuple[Frame, ...]],
-    fps: float,
+    seconds: Float[np.ndarray, "T"],
 ) -> MotionFacts:
     """Measures a motion.
 
@@ -82,7 +82,7 @@ def motion_facts(
         translations: of every frame, metres.
         joints: of this person in the T-pose.
         splits: the capture's.
-        fps: frames per second.
+        seconds: when each frame was taken.
     """
     times = sorted({frame.frame_index for frames in splits.values() for frame in frames})
     train = splits["train"]
@@ -95,7 +95,7 @@ def motion_facts(
     jumps: list[int] = []
     deviations: list[np.ndarray] = []
     for run in _runs(times, {frame.frame_index for frame in splits.get("novel_pose", ())}):
-        bad, deviation = _jumps(moving[run], rotations[run, 0], np.array(run) / fps)
+        bad, deviation = _jumps(moving[run], rotations[run, 0], seconds[run])
         jumps += [time for time, yes in zip(run, bad.tolist(), strict=True) if yes]
         deviations.append(deviation)
     azimuths, elevations = _directions(train, rotations[:, 0], placed[:, 0])

@@ -7,6 +7,7 @@ one that stands, and its feet may float or slide without any pixel's notice.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -95,7 +96,7 @@ def standing_facts(
     poses: Float[Tensor, "T 24 3"],
     translations: Float[Tensor, "T 3"],
     joints: Float[Tensor, "24 3"],
-    fps: float,
+    seconds: Float[np.ndarray, "T"],
     frames: Sequence[int] | None = None,
 ) -> StandingFacts:
     """Measures a motion in a world with y up.
@@ -104,10 +105,10 @@ def standing_facts(
         poses: of consecutive frames, axis-angle, radians.
         translations: metres.
         joints: of this person in the T-pose, metres.
-        fps: frames per second.
+        seconds: when each frame was taken.
         frames: that count; all by default. Poses of frames that are left out may be anything.
 
-    >>> still = standing_facts(torch.zeros(5, 24, 3), torch.zeros(5, 3), torch.rand(24, 3), 10.0)
+    >>> still = standing_facts(torch.zeros(5, 24, 3), torch.zeros(5, 3), torch.rand(24, 3), np.arange(5) / 10)
     >>> still.floating, still.sliding
     (0.0, 0.0)
     """
@@ -125,7 +126,8 @@ def standing_facts(
     carried = _on_legs(placed, joints)
     lowest = feet[..., 1].mean(2).amin(1)
     following = torch.diff(times) == 1
-    slower = (places[1:] - places[:-1]).norm(dim=-1).amin(1)[following] * fps
+    slower = (places[1:] - places[:-1]).norm(dim=-1).amin(1)[following]
+    slower = slower / torch.as_tensor(np.diff(seconds[times.numpy()]), dtype=slower.dtype)[following]
     upward = torch.nn.functional.normalize(placed[:, 12] - placed[:, 0], dim=-1)[:, 1]
     floor = float(torch.quantile(lowest, 0.1))
     return StandingFacts(

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from PIL import Image
 
-from twofold.body.motion import Motion
 from twofold.files import made_folder, write_bytes
 from twofold.geometry.cameras import Camera
 from twofold.inputs import is_there
@@ -92,11 +91,12 @@ def save_glb(folder: Path, viewed: Viewed, state: SceneState, meshes: Meshes) ->
     """
     character = meshes.of("full")[0]
     back = viewed.turn.T
-    clips = [_clip(character, state.timeline.name, state.timeline.poses, state.timeline.fps)]
+    line = state.timeline
+    clips = [_clip(character, line.name, line.poses, [line.begins(frame) for frame in range(len(line))])]
     if meshes.baked is not None and state.timeline.name == "capture: train":
         clips = [capture_clip(meshes.baked, state.timeline.name)]
     if state.edited:
-        clips.append(_clip(character, "edited pose", (state.pose,), state.timeline.fps))
+        clips.append(_clip(character, "edited pose", (state.pose,), [0.0]))
     standing = tuple(grounded(turned(clip, back, character.joints[0]), character) for clip in clips)
     path = next_name(folder, "avatar", ".glb")
     with made_folder(folder):
@@ -104,9 +104,8 @@ def save_glb(folder: Path, viewed: Viewed, state: SceneState, meshes: Meshes) ->
     return path
 
 
-def _clip(character: Character, name: str, poses: Sequence[BodyPose], fps: float) -> Animation:
+def _clip(character: Character, name: str, poses: Sequence[BodyPose], seconds: Sequence[float]) -> Animation:
     """The poses as an animation; morph targets, where there are any, stay at their means."""
     weights = np.zeros((len(poses), len(character.targets)), dtype=np.float32) if len(character.targets) else None
-    motion = Motion(name, torch.stack([p.pose for p in poses]), torch.stack([p.translation for p in poses]), fps)
-    times = (np.arange(len(motion)) / fps).astype(np.float32)
-    return Animation(name, times, motion.poses.numpy(), motion.translations.numpy(), weights)
+    turns, places = (torch.stack([getattr(p, part) for p in poses]).numpy() for part in ("pose", "translation"))
+    return Animation(name, np.array(seconds, dtype=np.float32), turns, places, weights)

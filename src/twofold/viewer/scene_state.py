@@ -118,7 +118,7 @@ class SceneState:
             now: a clock's time, seconds.
         """
         with self._lock:
-            self._playing_since = now - self._frame / self._timeline.fps
+            self._playing_since = now - self._timeline.begins(self._frame)
 
     def stop(self) -> None:
         """Stays at the present frame."""

@@ -1,5 +1,6 @@
 """What can be scrubbed: the frames of a capture's splits, and motions."""
 
+from bisect import bisect_right
 from dataclasses import dataclass
 
 import torch
@@ -23,19 +24,27 @@ class Timeline:
         poses: at least one.
         fps: frames per second.
         labels: a frame's name each; empty for those that are counted from 0.
+        seconds: when each frame begins, from 0, where the rate varies; `fps` is the mean then.
     """
 
     name: str
     poses: tuple[BodyPose, ...]
     fps: float
     labels: tuple[str, ...] = ()
+    seconds: tuple[float, ...] = ()
 
     def __len__(self) -> int:
         return len(self.poses)
 
     def at(self, seconds: float) -> int:
         """The frame that is shown this long after the first one, over and over again."""
-        return int(seconds * self.fps) % len(self.poses)
+        if not self.seconds:
+            return int(seconds * self.fps) % len(self.poses)
+        return bisect_right(self.seconds, seconds % (self.seconds[-1] + 1 / self.fps)) - 1
+
+    def begins(self, frame: int) -> float:
+        """Seconds from the first frame to this one."""
+        return self.seconds[frame] if self.seconds else frame / self.fps
 
 
 def split_timelines(capture: Capture, avatar: Avatar | None) -> list[Timeline]:
@@ -48,7 +57,9 @@ def split_timelines(capture: Capture, avatar: Avatar | None) -> list[Timeline]:
             ordered = [by_index[index] for index in sorted(by_index)]
             poses = tuple(frame_pose(f, capture, avatar, f.frame_index in trained) for f in ordered)
             labels = tuple(str(frame.frame_index) for frame in ordered)
-            found.append(Timeline(f"capture: {split}", poses, capture.fps, labels))
+            taken = capture.seconds_of(sorted(by_index))
+            seconds = () if capture.seconds is None else tuple((taken - taken[0]).tolist())
+            found.append(Timeline(f"capture: {split}", poses, capture.fps, labels, seconds))
     return found
 
 

@@ -129,6 +129,14 @@ def test_clip_starts_over_the_origin_with_its_lowest_point_on_the_ground(baked: 
     assert abs(min(lowest)) < 1e-4
 
 
+def test_clip_of_a_capture_whose_rate_varies_has_the_times_of_its_frames(baked: Baked) -> None:
+    trained = sorted({frame.frame_index for frame in baked.capture.train})
+    np.testing.assert_allclose(capture_clip(baked).times, np.array(trained) / baked.capture.fps, rtol=1e-6)
+    seconds = torch.arange(trained[-1] + 1, dtype=torch.float64) ** 1.5
+    uneven = replace(baked, capture=replace(baked.capture, seconds=seconds))
+    np.testing.assert_allclose(capture_clip(uneven).times, np.array(trained) ** 1.5, rtol=1e-6)
+
+
 @pytest.mark.parametrize("axis", ["y", "-y", "z", "-x"])
 def test_turned_clip_is_the_turned_motion(baked: Baked, person: Capture, axis: str) -> None:
     from twofold.outputs.export.character import pose_character

@@ -21,7 +21,7 @@ WEIGHED = 60
 def capture_clip(baked: Baked, name: str = "capture", weighed: int = WEIGHED) -> Animation:
     """The training motion in the capture's world, with the learned corrections of its poses; see `motion_clip`."""
     times = sorted({frame.frame_index for frame in baked.capture.train})
-    return _clip(baked, name, training_poses(baked.capture), np.array(times) / baked.capture.fps, weighed)
+    return _clip(baked, name, training_poses(baked.capture), baked.capture.seconds_of(times), weighed)
 
 
 def motion_clip(baked: Baked, motion: Motion, weighed: int = WEIGHED) -> Animation:
