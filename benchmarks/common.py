@@ -50,7 +50,7 @@ def commit() -> str | None:
 
     try:
         head = told("rev-parse", "--short=7", "HEAD")
-        return head + "+" * bool(told("status", "--porcelain", "--", "src")) if head else None
+        return head + "+" * bool(told("status", "--porcelain", "--", "src", "benchmarks/*.py")) if head else None
     except (OSError, subprocess.SubprocessError):
         return None
 

@@ -11,9 +11,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common import RESULTS
+from benchmarks.common import store
 from twofold.capture.folder import read_capture
-from twofold.files import write_json
 from twofold.methods.table import RECIPES, fitted, recipe_to_dict, with_steps
 from twofold.training.run import find_capture, read_recipe
 
@@ -75,7 +74,7 @@ def main() -> None:
     given = parser.parse_args()
     parts = [json.loads((c / "comparison.json").read_text("utf-8")) for c in (given.comparison, *given.also)]
     comparison = {**parts[0], "runs": [run for part in parts for run in part["runs"]]}
-    write_json(RESULTS / f"methods-{given.name}.json", stored(comparison, given.runs, given.capture))
+    store(f"methods-{given.name}", stored(comparison, given.runs, given.capture))
 
 
 if __name__ == "__main__":

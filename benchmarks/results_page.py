@@ -62,26 +62,27 @@ def results_page(results: dict[str, Any]) -> str:
         "# Results\n\n"
         + (f"{answer(study)}{others}\n\n" if study else "")
         + "Made from the JSON files in `benchmarks/results/` by `python -m benchmarks.results_page`. All "
-        "numbers are from CPUs with two cores and AVX-512; each section names the processor and the commit. Numbers in "
-        "dB are PSNR over the bounding box of the person's true mask (the box).\n",
+        "numbers are from CPUs with two cores and AVX-512; each section names the processor and the commit that it was "
+        "stored with. Numbers in dB are PSNR over the bounding box of the person's true mask (the box).\n",
         f"## Avatars and fits\n\n{_captures(results['captures'])}",
         *_studies(results),
         *_single(results, "variants", lambda result: variants_section.section(result, _table)),
         *_single(results, "camera-colors", _camera_colors),
         "## Training step\n\nSame networks, rays and losses. `fast` has the paper's network sizes, the shell sampler, "
         "a hand-written reverse pass and bfloat16 hidden layers; the reference form is the usual one: error-bounded "
-        f"sampler, autograd through autograd, dense samples, float32. {_when(_named(results, 'step-').values())} "
+        f"sampler, autograd through autograd, dense samples, float32. {_provenance(_named(results, 'step-').values())} "
         "`python -m benchmarks.step`.\n\n" + _steps(_named(results, "step-")),
         "## Training step of the other methods\n\nThe fast recipe against the form of the authors' program (every "
         "sample shaded, float32, gradients by automatic differentiation): same networks, weights and rays. Seconds of "
         "the processor on one thread, measured beside other programs. "
-        f"{_when([results['method-steps-cpu-1threads']])} `python -m benchmarks.method_steps`.\n\n"
+        f"{_provenance([results['method-steps-cpu-1threads']])} `python -m benchmarks.method_steps`.\n\n"
         + _method_steps(results["method-steps-cpu-1threads"]),
         *_methods(results),
-        f"## Rendering\n\nSeconds for one image, posing included. {_when(_named(results, 'rendering-').values())} "
-        "`python -m benchmarks.rendering`.\n\n" + _rendering(_named(results, "rendering-")),
+        "## Rendering\n\nSeconds for one image, posing included. "
+        f"{_provenance(_named(results, 'rendering-').values())} `python -m benchmarks.rendering`.\n\n"
+        + _rendering(_named(results, "rendering-")),
         "## Quality against time\n\nSynthetic subject, one training camera. "
-        f"{_when(_named(results, 'quality-').values())} `python -m benchmarks.quality`.\n\n"
+        f"{_provenance(_named(results, 'quality-').values())} `python -m benchmarks.quality`.\n\n"
         + _quality(_named(results, "quality-")),
         *sharpness_section.section(results, _table),
         *_completions(_named(results, "completion-", "")),
@@ -155,7 +156,7 @@ def _named(results: dict[str, Any], prefix: str, part: str = "cpu") -> dict[str,
 
 def _single(results: dict[str, Any], name: str, shown: Callable[[dict[str, Any]], str]) -> list[str]:
     """The section of one result, and when it was measured."""
-    return [f"{shown(results[name]).rstrip()}\n\n{_when([results[name]])}\n"] if name in results else []
+    return [f"{shown(results[name]).rstrip()}\n\n{_provenance([results[name]])}\n"] if name in results else []
 
 
 def _studies(results: dict[str, Any]) -> list[str]:
@@ -167,7 +168,7 @@ def _studies(results: dict[str, Any]) -> list[str]:
         "study-main": "## The full model and the methods that the paper compares with",
     }
     return [
-        f"{titles.get(name, f'## Study {name[6:]}')}\n\n{section(study, _table)}" + f"\n{_when([study])}\n"
+        f"{titles.get(name, f'## Study {name[6:]}')}\n\n{section(study, _table)}" + f"\n{_provenance([study])}\n"
         for name, study in results.items()
         if name.startswith("study-")
     ]
@@ -179,14 +180,14 @@ def _methods(results: dict[str, Any]) -> list[str]:
         f"## Methods side by side: {heading[0].lower()}{heading[1:]}\n\nTrained by their fast recipes for minutes of "
         "one thread, without LPIPS, while other programs ran; [images](methods/index.md#side-by-side). "
         f"`twofold compare`.\n\n{side_by_side(results[f'methods-{name}'], _table)}\n"
-        f"{_when([results[f'methods-{name}']])}\n"
+        f"{_provenance([results[f'methods-{name}']])}\n"
         for name, heading in METHODS.items()
         if f"methods-{name}" in results
     ]
 
 
-def _when(results: Iterable[dict[str, Any]]) -> str:
-    """At which commits and on which processors results were measured, a sentence."""
+def _provenance(results: Iterable[dict[str, Any]]) -> str:
+    """With which commits results were stored, and on which processors they were measured, a sentence."""
     many = list(results)
     commits = sorted({str(result["commit"]) for result in many})
     processors = sorted({str(result["machine"]["processor"]) for result in many})
@@ -195,8 +196,8 @@ def _when(results: Iterable[dict[str, Any]]) -> str:
 
 def _captures(captures: dict[str, Any]) -> str:
     rows = [(row["subject"], row["result"], f"`{row['command']}`: {row['how']}") for row in captures["rows"]]
-    text = captures["what"]
-    return f"{_table(('What', 'Result', 'How'), rows)}\n{text[:1].upper()}{text[1:]}.\n"
+    text, processor = captures["what"], captures["machine"]["processor"]
+    return f"{_table(('What', 'Result', 'How'), rows)}\n{text[:1].upper()}{text[1:]}. {processor}.\n"
 
 
 def _steps(results: dict[str, Any]) -> str:
@@ -295,7 +296,7 @@ def _completions(results: dict[str, Any]) -> list[str]:
         "that show what no training image shows, and of those that show what one does; PSNR over the person in "
         "training images. `python -m benchmarks.completion`.\n\n"
     )
-    return [f"{text}{_table(head, rows)}\n{_when(results.values())}\n"] if rows else []
+    return [f"{text}{_table(head, rows)}\n{_provenance(results.values())}\n"] if rows else []
 
 
 def _ratio(result: dict[str, Any]) -> float:

@@ -72,7 +72,7 @@ def pose_at(avatar: Avatar, capture: Capture, frame: Frame) -> PosedAvatar[Any]:
     A training frame has a correction of its own. Another frame between two of these takes theirs, interpolated, if they
     are no more than `NEAR` seconds apart. All others stay as the capture has them.
     """
-    return avatar.pose(*avatar.refined_pose(frame.frame_index, frame.pose, frame.translation, NEAR * capture.fps))
+    return avatar.pose(*avatar.refined_pose(frame.frame_index, frame.pose, frame.translation, NEAR, capture.second))
 
 
 def sampled(count: int, of: int, what: str) -> str:

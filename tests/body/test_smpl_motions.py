@@ -186,3 +186,17 @@ def test_single_arrays_and_missing_files_are_said(tmp_path):
         read_smpl_motion(tmp_path / "motion.npz", SMPL_SIZED)
     with pytest.raises(TwofoldError, match="missing"):
         read_smpl_motion(tmp_path / "other.npz", SMPL_SIZED)
+
+
+def test_frames_of_a_capture_that_were_taken_at_a_varying_rate_are_resampled(tmp_path):
+    seconds = np.cumsum([0.0, *np.tile([0.1, 0.3], 30)[:59]])
+    found = read_smpl_motion(saved(tmp_path, FILES["capture"][0] | {"seconds": seconds}), SMPL_SIZED)
+    assert found.motion.fps == pytest.approx(59 / seconds[-1])
+    assert any("varying rate" in note for note in found.notes)
+    assert not any("no frame rate" in note for note in found.notes)
+    even = np.interp(np.linspace(0, seconds[-1], 60), seconds, np.arange(60))
+    whole = read_smpl_motion(saved(tmp_path, FILES["capture"][0]), SMPL_SIZED).motion.translations.numpy()
+    expected = np.stack([np.interp(even, np.arange(60), whole[:, axis]) for axis in range(3)], 1)
+    np.testing.assert_allclose(found.motion.translations.numpy(), expected, atol=1e-6)
+    with pytest.raises(TwofoldError, match="seconds should be 60 increasing numbers"):
+        read_smpl_motion(saved(tmp_path, FILES["capture"][0] | {"seconds": seconds[::-1]}), SMPL_SIZED)

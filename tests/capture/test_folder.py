@@ -115,6 +115,8 @@ def test_times_of_frames_are_kept_where_the_rate_varies(tmp_path, tiny):
     seconds = torch.tensor([0.0, 0.1, 0.2, 0.7, 0.8, 1 / 3 + 1], dtype=torch.float64)
     write_tiny(tmp_path / "uneven", seconds=seconds)
     assert read_capture(tmp_path / "uneven").seconds_of([3, 5]).tolist() == [0.7, 1 / 3 + 1]
+    write_tiny(tmp_path / "clock", seconds=1764288000 + seconds)
+    assert read_capture(tmp_path / "clock").second(3) == pytest.approx(0.7, abs=1e-6), "counted from the first frame"
 
 
 def test_notes_are_kept_and_disturb_nothing(tmp_path):

@@ -98,6 +98,7 @@ def poses(time, value):
         ({"betas": np.full(1, 99.0)}, "betas should make a body of 0.3 to 3 metres, it measures"),
         ({"betas": np.zeros(2)}, "there are 2 betas, the body takes 1 at most"),
         ({"true_poses": np.zeros((5, 24, 3))}, "true_poses should be"),
+        ({"seconds": np.array([0, 3, 2, 4, 5, 6], np.uint8)}, "seconds should increase from frame to frame; not so at"),
         ({"seconds": np.zeros((5,))}, "seconds should be numbers of shape 6, it is float64 of (5,)"),
         (
             {"seconds": np.array([0, 1, 2, 2, 3, 1.0])},

@@ -153,6 +153,15 @@ def test_novelty_is_how_far_test_poses_are_from_all_training_poses(facts):
     assert 20 < facts(poses).novelty < 51
 
 
+def test_a_body_that_turns_is_no_jump_where_two_time_stamps_are_close(facts):
+    poses, translations = motion()
+    poses = poses.clone()
+    poses[:, 0] = torch.tensor([0.0, 1, 0]) * (torch.arange(MOMENTS) / FPS)[:, None]
+    seconds = np.arange(MOMENTS) / FPS
+    seconds[MOMENTS // 2 :] -= 1 / FPS - 0.002
+    assert facts(poses, translations, seconds=seconds).jumps == facts(poses, translations).jumps == ()
+
+
 def test_a_frame_that_was_taken_late_may_be_far_from_the_one_before(facts):
     poses, translations = motion()
     pause = MOMENTS // 2

@@ -1,6 +1,7 @@
 """Corrections of poses: where they apply, what learns, and how large they say they are."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -83,3 +84,17 @@ def test_change_is_the_root_mean_square():
         assert module.change()[name] == pytest.approx(expected, rel=1e-5)
     expected = math.sqrt(sum(b * b for b in module.shape.tolist()))
     assert module.change()["shape"] == pytest.approx(expected, rel=1e-5)
+
+
+def test_neighbours_count_by_when_they_were_taken():
+    refinement = PoseRefinement(torch.tensor([0, 4]), 10, ("translation",))
+    refinement.translation.data[1].fill_(1.0)
+    known = SimpleNamespace(times=torch.tensor([0, 4]), poses=torch.zeros(2, 24, 3), translations=torch.zeros(2, 3))
+    given = torch.zeros(24, 3), torch.zeros(3)
+
+    def moved(max_gap, seconds):
+        return refinement.at(1, *given, known, max_gap, seconds.__getitem__)[1].tolist()
+
+    late = (0.0, 0.75, 0.8, 0.9, 1.0)
+    assert moved(1.0, late) == pytest.approx([0.75] * 3)
+    assert moved(0.9, late) == [0.0] * 3, "they are a second apart"

@@ -17,14 +17,14 @@ class Sphere(DenseField):
     def sdf(self, x_canonical, pose):
         return x_canonical.norm(dim=-1) - self.radius
 
-    def distance_with_slope(self, x, pose):
+    def _distance_and_gradient(self, x, pose):
         sdf = self.sdf(x, pose)
         if self.analytic:
             return sdf, x / x.norm(dim=-1, keepdim=True)
         return sdf, torch.autograd.grad(sdf.sum(), x, create_graph=True)[0]
 
-    def answer(self, x, pose, to_observation):
-        sdf, gradient = self.distance_with_slope(x, pose)
+    def _evaluate(self, x, pose, to_observation):
+        sdf, gradient = self._distance_and_gradient(x, pose)
         base = FieldOutput(sdf - 1, x.sigmoid() * self.radius, gradient)
         return FieldOutput(sdf, x.sigmoid(), gradient, base)
 

@@ -111,3 +111,12 @@ def test_where_y_is_not_up_nothing_is_said():
     assert found.upright < standing.UPRIGHT
     assert topics(found) == []
     assert "does not stand along" in found.sentence()
+
+
+def test_feet_slide_by_the_time_between_frames():
+    translations = torch.tensor([[0.1, 0.0, 0.0]]) * torch.arange(20)[:, None]
+    body = little_body()
+    joints = shape_body(body, torch.zeros(body.shape_basis.shape[-1])).joints
+    slow = standing_facts(torch.zeros(20, 24, 3), translations, joints, 0.5 * np.arange(20))
+    assert slow.sliding == pytest.approx(0.2, rel=1e-4)
+    assert measured(translations=translations).sliding == pytest.approx(1.0, rel=1e-4)

@@ -8,6 +8,7 @@ from tiny_person import tiny_recipe
 
 from twofold.errors import TwofoldError
 from twofold.inputs import read_json
+from twofold.reproduce import cells
 from twofold.reproduce.cells import CELL, FAILURE, RESULTS, RUN, Cell, read_cell, run_cell, store_cell
 from twofold.reproduce.measuring import Measures
 from twofold.reproduce.sources import FolderSource, StudioSource, folder_digest
@@ -139,3 +140,14 @@ def test_measuring_anew_trains_nothing(person_cell, tmp_path, monkeypatch):
     assert not steps
     assert len(found["images"]) == 2
     assert found["seconds"]["seconds_per_step"] > 0
+
+
+def test_a_damaged_true_mesh_is_told_before_the_training(person_cell, tmp_path, monkeypatch):
+    def damaged(capture, most):
+        raise TwofoldError("a mesh is damaged")
+
+    monkeypatch.setattr(cells, "require_meshes", damaged)
+    monkeypatch.setattr(cells.loop, "train", lambda *given: pytest.fail("it trains"))
+    folder = store_cell(replace(person_cell, measures=Measures(2, 1, False)), tmp_path)
+    run_cell(str(folder))
+    assert read_cell(folder).failure(tmp_path) == "a mesh is damaged"

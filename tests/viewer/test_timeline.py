@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -28,7 +29,9 @@ def test_a_frame_is_shown_until_the_next_one_was_taken():
 
 def test_timelines_of_a_capture_begin_with_their_first_frame(person_folder):
     capture = read_capture(person_folder)
-    assert all(line.seconds == () for line in split_timelines(capture, None))
+    for line in split_timelines(capture, None):
+        indices = np.array([int(label) for label in line.labels])
+        assert line.seconds == pytest.approx((indices - indices[0]) / capture.fps)
     last = max(frame.frame_index for frames in capture.splits.values() for frame in frames)
     capture = replace(capture, seconds=5 + torch.arange(last + 1, dtype=torch.float64) ** 2)
     line = split_timelines(capture, None)[0]

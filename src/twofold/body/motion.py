@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -99,6 +100,30 @@ def resampled(motion: Motion, fps: float) -> Motion:
         return replace(motion, fps=float(fps))
     count = math.floor(motion.seconds * fps + 1e-6) + 1
     at = (torch.arange(count, dtype=torch.float64) * (motion.fps / fps)).clamp_max(len(motion) - 1)
+    return _between_frames(motion, at, fps)
+
+
+def evenly_timed(motion: Motion, seconds: Float[np.ndarray, "T"]) -> Motion:
+    """The motion at its mean rate, of frames that were taken at these times.
+
+    >>> late = Motion("late", torch.zeros(3, 24, 3), torch.arange(3.0)[:, None].expand(3, 3), 1.0)
+    >>> moved = evenly_timed(late, np.array([0.0, 1.0, 4.0]))
+    >>> moved.fps, [round(place, 3) for place in moved.translations[:, 0].tolist()]
+    (0.5, [0.0, 1.333, 2.0])
+
+    Args:
+        motion: its rate does not count.
+        seconds: when each frame was taken, increasing.
+    """
+    if len(motion) < 2:
+        return motion
+    even = np.linspace(seconds[0], seconds[-1], len(seconds))
+    at = torch.from_numpy(np.interp(even, seconds, np.arange(len(seconds))))
+    return _between_frames(motion, at, (len(seconds) - 1) / float(seconds[-1] - seconds[0]))
+
+
+def _between_frames(motion: Motion, at: Float[Tensor, "n"], fps: float) -> Motion:
+    """The motion at fractional frames, which make a motion of this rate."""
     low = at.floor().long().clamp_max(len(motion) - 2)
     share = at - low
     first = axis_angle_to_matrix(motion.poses[low].double())

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from twofold.body.foot_contacts import kept_contacts
 from twofold.body.leg_ik import TOES
-from twofold.body.motion import Motion, joint_frames, leg_length, turned_upright, up_axis
+from twofold.body.motion import Motion, evenly_timed, joint_frames, leg_length, turned_upright, up_axis
 from twofold.body.skeleton import Body, ShapedBody, shape_body
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
@@ -99,8 +99,8 @@ def read_smpl_motion(
     layout = _layout(arrays, path)
     poses = _poses(arrays, layout, path)
     frames, notes = len(poses), list[str]()
-    fps = _rate(arrays, layout, path)
-    if fps is None:
+    fps, seconds = _rate(arrays, layout, path), _seconds(arrays, layout, frames, path)
+    if fps is None and seconds is None:
         fps = layout.fps
         notes.append(f"the file has no frame rate ({', '.join(_RATES[:3])}), {fps:g} fps was taken")
     translations = _translations(arrays, layout, frames, units, path)
@@ -111,7 +111,12 @@ def read_smpl_motion(
         None if betas is None or betas.dtype.kind not in "fiu" else torch.from_numpy(betas.astype(np.float64)).ravel()
     )
     place = torch.zeros(frames, 3, dtype=torch.float64) if translations is None else translations
-    motion = Motion(path.stem, poses, place, fps, betas)
+    motion = Motion(path.stem, poses, place, fps or layout.fps, betas)
+    if seconds is not None:
+        motion = evenly_timed(motion, seconds)
+        notes.append(
+            f"its frames were taken at a varying rate, on average {motion.fps:.4g} fps, and are resampled to that"
+        )
     found = up or up_axis(axis_angle_to_matrix(poses[:, 0])[..., 1])
     if found is None:
         found = layout.up
@@ -130,10 +135,21 @@ def read_smpl_motion(
     return SmplMotion(motion, name, frames, found, unit, tuple(notes))
 
 
+def _seconds(arrays: dict[str, np.ndarray], layout: Layout, frames: int, path: Path) -> Float[np.ndarray, "T"] | None:
+    """When the frames of a capture's motion were taken, where it says so."""
+    if layout.name != "capture" or "seconds" not in arrays:
+        return None
+    seconds = arrays["seconds"]
+    fits = seconds.dtype.kind in "fiu" and seconds.shape == (frames,) and bool(np.isfinite(seconds).all())
+    if not fits or (np.diff(seconds.astype(np.float64)) <= 0).any():
+        raise TwofoldError(f"{path}: seconds should be {frames} increasing numbers, one for each frame.")
+    return seconds.astype(np.float64)
+
+
 def _plain_arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of numbers that some layout names; whatever else the file holds is not opened."""
     wanted = {name for layout in LAYOUTS for name in (*layout.poses, *layout.translations, *layout.rates)}
-    wanted |= {"betas", "smpl_scaling"}
+    wanted |= {"betas", "smpl_scaling", "seconds"}
     return read_npz(path, wanted)
 
 

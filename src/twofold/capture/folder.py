@@ -203,7 +203,7 @@ class CaptureWriter:
             true_poses: where `poses` were disturbed, what they were.
             true_translations: likewise.
             seconds: when each frame was taken, where the rate varies.
-            notes: anything worth keeping about how it was made (numbers, texts, lists); nothing reads it.
+            notes: how it was made (numbers, texts, lists). Training needs none of it.
             thorough: also judges the pixels of every image, for images that nobody has looked at yet.
 
         Raises:

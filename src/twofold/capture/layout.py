@@ -56,7 +56,7 @@ class Contents:
         betas: its shape coefficients.
         poses: axis-angle, radians, one frame a row.
         translations: metres.
-        seconds: when each frame was taken, where the rate varies.
+        seconds: when each frame was taken, from the first one on, where the rate varies.
     """
 
     folder: Path
@@ -345,17 +345,19 @@ def _read_motion(
             bad = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(1)).tolist()
             where = "elements" if name == "betas" else "times"
             faults.append(f"{MOTION}: {name} is not finite at {where} {spans(bad)}; estimate or leave these out.")
-        elif not are_moderate(array):
+        elif name != "seconds" and not are_moderate(array):
             faults.append(f"{MOTION}: {name} holds numbers beyond a thousand million; give metres and radians.")
         elif name.endswith("poses") and (turns := np.linalg.norm(array, axis=-1)).size and turns.max() > 4 * np.pi:
             bad = np.flatnonzero((turns > 4 * np.pi).any(-1)).tolist()
             faults.append(f"{MOTION}: {name} turns joints by more than two turns at times {spans(bad)}; give radians.")
-        elif name == "seconds" and (back := np.flatnonzero(np.diff(array) <= 0) + 1).size:
+        elif name == "seconds" and (back := np.flatnonzero(np.diff(array.astype(float)) <= 0) + 1).size:
             faults.append(
                 f"{MOTION}: seconds should increase from frame to frame; not so at times {spans(back.tolist())}."
             )
+        elif name == "seconds":
+            read[name] = torch.as_tensor(array.astype(np.float64) - (float(array[0]) if moments else 0.0))
         else:
-            read[name] = torch.as_tensor(array.astype(np.float64 if name == "seconds" else np.float32))
+            read[name] = torch.as_tensor(array.astype(np.float32))
     betas = read.get("betas")
     if body is not None and betas is not None and len(betas) > body.shape_basis.shape[-1]:
         faults.append(f"{MOTION}: there are {len(betas)} betas, the body takes {body.shape_basis.shape[-1]} at most.")

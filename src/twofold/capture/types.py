@@ -85,7 +85,8 @@ class Capture:
         splits: frames of "train", "novel_view" and "novel_pose" (the last two may be empty).
         meshes: true posed surfaces by time (npz with vertices in metres and faces), where they are known.
         credit: whom to name when showing it; empty for one's own.
-        seconds: when each frame of the motion was taken, where the rate varies; `fps` is the mean then.
+        seconds: when each frame of the motion was taken, from the first one on, where the rate varies; `fps` is the
+            mean then.
     """
 
     name: str
@@ -98,6 +99,10 @@ class Capture:
     meshes: dict[int, Path] = field(default_factory=dict)
     credit: str = ""
     seconds: Float[Tensor, "T"] | None = None
+
+    def second(self, frame: int) -> float:
+        """When a frame was taken, seconds, by its index."""
+        return float(self.seconds_of([frame])[0])
 
     def seconds_of(self, frames: Sequence[int]) -> Float[np.ndarray, "n"]:
         """When frames were taken, seconds, by their indices."""
@@ -132,10 +137,12 @@ def steady_video(capture: Capture, most: int = VIDEO_LENGTH) -> list[Frame]:
             step = min(
                 (b.frame_index - a.frame_index for a, b in pairwise(taken) if b.frame_index > a.frame_index), default=0
             )
+            usual = np.median(np.diff(capture.seconds_of([f.frame_index for f in taken]))) if len(taken) > 1 else 0.0
             run = taken[:1]
             for before, now in pairwise(taken):
                 still = torch.equal(before.camera.world_to_camera, now.camera.world_to_camera)
-                run = [*run, now] if now.frame_index - before.frame_index == step and still else [now]
+                near = capture.second(now.frame_index) - capture.second(before.frame_index) < 1.5 * usual
+                run = [*run, now] if now.frame_index - before.frame_index == step and still and near else [now]
                 if len(run) > max(len(best), 1):
                     best = run
         if best:

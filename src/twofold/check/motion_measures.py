@@ -13,6 +13,7 @@ from torch import Tensor
 
 from twofold.body.skeleton import JOINT_NAMES, joint_transforms
 from twofold.capture.types import Frame, spread
+from twofold.geometry.accelerations import SHORTEST
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.prepare.turning import arc, camera_directions, sides_seen
 
@@ -177,14 +178,16 @@ def _jumps(
     bad = np.zeros(count, bool)
     if count < 3:
         return bad, np.empty(0, np.float32)
-    before, after = np.diff(seconds)[:-1], np.diff(seconds)[1:]
+    # Time stamps are rounded: two frames are never closer than a share of the usual distance.
+    gaps = np.maximum(np.diff(seconds), SHORTEST * (seconds[-1] - seconds[0]) / (count - 1))
+    before, after = gaps[:-1], gaps[1:]
     weight = torch.as_tensor(after / (before + after), dtype=joints.dtype)[:, None, None]
     away = (joints[1:-1] - weight * joints[:-2] - (1 - weight) * joints[2:]).norm(dim=-1).numpy()
     excess = away.max(1) - (SLACK + 0.5 * ACCELERATION * before * after)
     # Beside one wrong frame others deviate by half as much; only the worst of a group is it.
     worst = ndimage.maximum_filter1d(excess, 3, mode="nearest") == excess
     bad[1:-1] = (excess > 0) & worst
-    bad[1:] |= _angles(roots[:-1].transpose(-1, -2) @ roots[1:]).numpy() > TURN_SPEED * np.diff(seconds)
+    bad[1:] |= _angles(roots[:-1].transpose(-1, -2) @ roots[1:]).numpy() > TURN_SPEED * gaps
     return bad, away.ravel()
 
 

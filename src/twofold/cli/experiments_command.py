@@ -63,7 +63,7 @@ def reproduce(
         workers: Cells at the same time on this machine; they share its threads.
         dry_run: Lists the cells and the hours that are left, and does nothing else.
         shard: i/n does the i-th of n parts of the cells, for any scheduler; the folder is shared.
-        cluster: slurm submits a job for each cell (pip install 'twofold[slurm]'); local and debug try that without it.
+        cluster: slurm submits a job for each cell (needs the extra slurm); local and debug try that without it.
         cluster_hours: Limit of a job.
         cluster_gpus: GPUs of a job.
     """

@@ -30,7 +30,7 @@ LOWER = {
     "prepare": "make the images smaller (--max-size), or use fewer of them (--fps)",
     "studio": "lower --size or --frames",
     "demo": "close other programs",
-    "convert": "make the images smaller (--scale)",
+    "convert": "make the images smaller (--scale, where the format takes it)",
     "import": "make the images smaller",
     "export": "lower --texture and --faces, or close other programs",
     "report": "lower --texture, --faces and --size, or close other programs",

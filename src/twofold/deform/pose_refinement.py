@@ -1,5 +1,6 @@
 """Corrections to estimated poses, learned along with the avatar."""
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -78,7 +79,7 @@ class PoseRefinement(nn.Module):
 
     def at(
         self, time: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], known: KnownPoses,
-        max_gap: float,
+        max_gap: float, clock: Callable[[int], float] = float,
     ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:  # fmt: skip
         """A frame's corrected pose: by its own correction, or by its neighbours' (`between`), or as given.
 
@@ -87,17 +88,18 @@ class PoseRefinement(nn.Module):
             pose: as given, radians.
             translation: as given, metres.
             known: the training frames with their poses as given.
-            max_gap: largest number of frames between the neighbours.
+            max_gap: largest distance between the neighbours, by the clock.
+            clock: when a frame was taken; by default its index.
         """
         times = known.times.tolist()
         if time in self.rows or not self.parts or not times[0] < time < times[-1]:
             return self(time, pose, translation)
         after = next(row for row, other in enumerate(times) if other > time)
         before = after - 1
-        if times[after] - times[before] > max_gap:
+        if clock(times[after]) - clock(times[before]) > max_gap:
             return pose, translation
         neighbours = tuple((times[r], known.poses[r].to(pose), known.translations[r].to(pose)) for r in (before, after))
-        return self.between(neighbours, time, pose, translation)
+        return self.between(neighbours, time, pose, translation, clock)
 
     def between(
         self,
@@ -105,6 +107,7 @@ class PoseRefinement(nn.Module):
         time: int,
         pose: Float[Tensor, "24 3"],
         translation: Float[Tensor, "3"],
+        clock: Callable[[int], float] = float,
     ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
         r"""A frame that was not trained on, corrected by what its neighbours in time were corrected by.
 
@@ -126,9 +129,10 @@ class PoseRefinement(nn.Module):
             time: the frame between them.
             pose: as given, radians.
             translation: as given, metres.
+            clock: when a frame was taken; by default its index.
         """
         (before, *_), (after, *_) = neighbours
-        share = (time - before) / (after - before)
+        share = (clock(time) - clock(before)) / (clock(after) - clock(before))
         turn, shift = torch.zeros_like(pose), torch.zeros_like(translation)
         for weight, (known, given, place) in zip((1 - share, share), neighbours, strict=True):
             better, moved = self(known, given, place)

@@ -11,7 +11,7 @@ from twofold.field.output import FieldOutput
 
 
 class DenseField(nn.Module):
-    """A field of dense networks in canonical space. What differs is `answer`, `distance_with_slope` and `sdf`.
+    """A field of dense networks in canonical space. What differs is `_evaluate`, `_distance_and_gradient` and `sdf`.
 
     Gradients of the distance by the point are "analytic", a reverse pass written out, or of "autograd", the plain form:
     then points become leaves of torch's graph, and without gradient mode answers are detached.
@@ -21,16 +21,16 @@ class DenseField(nn.Module):
         super().__init__()
         self.analytic = gradients == "analytic"
 
-    def answer(
+    def _evaluate(
         self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"], to_observation: Float[Tensor, "S 3 3"] | None
     ) -> FieldOutput:
-        """Distance, colour and gradient at points that gradients can be taken by."""
+        """Distance, colour and gradient at points that require gradients where `autograd` takes them."""
         raise NotImplementedError
 
-    def distance_with_slope(
+    def _distance_and_gradient(
         self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
     ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
-        """The distance and its gradient at points that gradients can be taken by."""
+        """The distance and its gradient at points that require gradients where `autograd` takes them."""
         raise NotImplementedError
 
     def sdf(self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> Float[Tensor, "S"]:
@@ -52,9 +52,9 @@ class DenseField(nn.Module):
                 moved by a matrix J that is the inverse transpose of J. None leaves normals canonical.
         """
         if self.analytic:
-            return self.answer(x_canonical, pose, to_observation)
+            return self._evaluate(x_canonical, pose, to_observation)
         with torch.enable_grad():
-            output = self.answer(_leaf(x_canonical), pose, to_observation)
+            output = self._evaluate(_leaf(x_canonical), pose, to_observation)
         return output if torch.is_grad_enabled() else _detached(output)
 
     def sdf_at(self, pose: Float[Tensor, "P"]) -> Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]:
@@ -66,9 +66,9 @@ class DenseField(nn.Module):
     ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
         """The distance and its canonical gradient, both differentiable by the parameters; no colour is computed."""
         if self.analytic:
-            return self.distance_with_slope(x_canonical, pose)
+            return self._distance_and_gradient(x_canonical, pose)
         with torch.enable_grad():
-            sdf, gradient = self.distance_with_slope(_leaf(x_canonical), pose)
+            sdf, gradient = self._distance_and_gradient(_leaf(x_canonical), pose)
         return (sdf, gradient) if torch.is_grad_enabled() else (sdf.detach(), gradient.detach())
 
 

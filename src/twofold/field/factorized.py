@@ -221,10 +221,10 @@ class FactorizedField(DenseField):
         gate = 1 / (1 + (base_sdf.detach() / self.config.gate_width) ** 4)
         return base + (gate[:, None] if base.dim() == 2 else gate) * detail
 
-    def answer(
+    def _evaluate(
         self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"], to_observation: Float[Tensor, "S 3 3"] | None
     ) -> FieldOutput:
-        """See `DenseField.answer`; `normals` says whether the colour networks see normals of observation space."""
+        """See `DenseField._evaluate`; `normals` says whether the colour networks see normals of observation space."""
         to_observation = to_observation if self.config.normals == "observation" else None
         low, high = self.at(pose)
         base = None if low is None else self.base_branch(x, low, to_observation)
@@ -247,10 +247,10 @@ class FactorizedField(DenseField):
             base=below,
         )
 
-    def distance_with_slope(
+    def _distance_and_gradient(
         self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
     ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
-        """See `DenseField.distance_with_slope`."""
+        """See `DenseField._distance_and_gradient`."""
         low, high = self.at(pose)
         base = None if low is None else self._geometry(self._encoded(x, self.config.low_octaves), None, low)
         detail = None if high is None else self._geometry(self._encoded(x, self.config.high_octaves), base, high)

@@ -98,20 +98,20 @@ class ImplicitField(DenseField):
         """The distance alone, metres: about a quarter of the cost of `forward`."""
         return self.networks.sdf.at(pose)(self._encoded(x_canonical), 1)[:, 0]
 
-    def answer(
+    def _evaluate(
         self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"], to_observation: Float[Tensor, "S 3 3"] | None
     ) -> FieldOutput:
-        """See `DenseField.answer`."""
+        """See `DenseField._evaluate`."""
         networks = self.networks.at(pose)
         geometry, gradient = self._geometry(networks, x)
         normal = gradient if to_observation is None else (to_observation * gradient[:, None]).sum(-1)
         inputs = torch.cat([x, F.normalize(normal, dim=-1, eps=1e-6), geometry.feature], -1)
         return FieldOutput(geometry.sdf, networks.color(inputs).sigmoid(), gradient)
 
-    def distance_with_slope(
+    def _distance_and_gradient(
         self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
     ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
-        """See `DenseField.distance_with_slope`."""
+        """See `DenseField._distance_and_gradient`."""
         geometry, gradient = self._geometry(self.networks.at(pose), x)
         return geometry.sdf, gradient
 

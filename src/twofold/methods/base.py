@@ -4,6 +4,7 @@ Everything above `methods` uses only what stands here, so it never knows which m
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Generic, Literal, TypeVar
@@ -382,12 +383,14 @@ class Avatar(nn.Module, ABC, Generic[Own]):
     # ---- refined poses
 
     def refined_pose(
-        self, frame_index: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], max_gap: float
-    ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
+        self, frame_index: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], max_gap: float,
+        clock: Callable[[int], float] = float,
+    ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:  # fmt: skip
         """A frame's pose with what training learned about the errors of the capture's poses.
 
         A training frame has a correction of its own. Another frame between two of these takes theirs, interpolated, if
-        they are no more than `max_gap` frames apart. All others stay as given, as they do without pose refinement.
+        they are at most `max_gap` apart by `clock`, which tells when a frame was taken (by default its index). All
+        others stay as given, as they do without pose refinement.
         """
         return pose, translation
 

@@ -346,12 +346,13 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         return self.query(x, posed, branch=branch).sdf
 
     def refined_pose(
-        self, frame_index: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], max_gap: float
-    ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:
+        self, frame_index: int, pose: Float[Tensor, "24 3"], translation: Float[Tensor, "3"], max_gap: float,
+        clock: Callable[[int], float] = float,
+    ) -> tuple[Float[Tensor, "24 3"], Float[Tensor, "3"]]:  # fmt: skip
         """See `Avatar.refined_pose`."""
         with torch.no_grad():
             given = pose.to(self.device), translation.to(self.device)
-            return self.refinement.at(frame_index, *given, self.subject, max_gap)
+            return self.refinement.at(frame_index, *given, self.subject, max_gap, clock)
 
     def pose_corrections(self) -> dict[str, float]:
         """See `Avatar.pose_corrections`."""

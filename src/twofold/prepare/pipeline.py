@@ -287,7 +287,7 @@ def _write(
     body: Body,
     config: PrepareConfig,
 ) -> Prepared:
-    watched = found.watched
+    watched, seconds = found.watched, np.array(found.watched[0].seconds)
     qualities = [quality for agreement in agreed for quality in agreement.qualities]
     kept, left_out = kept_times(qualities, ", ".join(found.cameras), advice(config, STEADIER), config.drop)
     poses, translations, cameras = _upright(found, body)
@@ -306,7 +306,7 @@ def _write(
     yaw = arc(camera_directions(roots, pelvises, center.expand(len(roots), 3))[0])
     moved, width = watched[index].moved, cameras[train].width
     joints = body.joints + body.joint_basis[..., : len(found.motion.betas)] @ found.motion.betas
-    standing = standing_facts(poses, translations, joints, np.array(watched[0].seconds), kept)
+    standing = standing_facts(poses, translations, joints, seconds, kept)
     warnings = [*found.remarks, *warnings_about(yaw, moved, width, left_out, len(cameras) > 1)]
     warnings += [f"{fault.what}. {fault.advice}" for fault in standing_faults(standing)]
     objects = {name: a.removed for name, a in zip(cameras, agreed, strict=True)}
@@ -323,9 +323,7 @@ def _write(
             "novel_pose": dict.fromkeys(cameras, held_out),
         },
         fps=found.fps,
-        seconds=torch.tensor(watched[0].seconds, dtype=torch.float64)
-        if are_uneven(np.array(watched[0].seconds))
-        else None,
+        seconds=torch.from_numpy(seconds) if are_uneven(seconds) else None,
         credit=config.credit,
         notes={
             "made_by": "twofold prepare",

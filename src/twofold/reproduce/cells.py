@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from twofold.errors import TwofoldError
+from twofold.evaluation import require_meshes
 from twofold.files import made_folder, write_json
 from twofold.inputs import read_json
 from twofold.kernels.runtime import tune_process
@@ -178,6 +179,8 @@ def train_and_measure(folder: Path) -> None:
     note = _Notes(folder)
     note(0.0, "capture")
     capture = cell.source.capture(folder.parent.parent / CAPTURES)
+    if cell.measures.max_meshes:
+        require_meshes(capture, cell.measures.max_meshes)
     device = choose_device("auto")
     run = folder / RUN
     begun = time.monotonic(), time.process_time()

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from twofold.capture.types import Capture, Frame, spread
-from twofold.evaluation import measure_consistency, measure_geometry, render_frame, require_meshes
+from twofold.evaluation import measure_consistency, measure_geometry, render_frame
 from twofold.methods.base import Avatar
 from twofold.metrics import detail, distribution
 from twofold.metrics import image as image_metrics
@@ -73,8 +73,6 @@ def measure_avatar(
     """
     weights = Path(measures.weights) if measures.weights else None
     networks = load_networks(weights, measures.unverified_weights or None)
-    if measures.max_meshes:
-        require_meshes(capture, measures.max_meshes)
     chosen = {split: spread(capture.splits.get(split, ()), measures.max_images) for split in SPLITS}
     count, done = max(sum(map(len, chosen.values())), 1), 0
     trained = torch.stack([frame.pose for frame in capture.train])

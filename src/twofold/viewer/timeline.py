@@ -2,6 +2,8 @@
 
 from bisect import bisect_right
 from dataclasses import dataclass
+from itertools import pairwise
+from statistics import median
 
 import torch
 from jaxtyping import Float
@@ -24,7 +26,7 @@ class Timeline:
         poses: at least one.
         fps: frames per second.
         labels: a frame's name each; empty for those that are counted from 0.
-        seconds: when each frame begins, from 0, where the rate varies; `fps` is the mean then.
+        seconds: when each frame begins, from 0; empty for frames that follow each other at `fps`.
     """
 
     name: str
@@ -40,7 +42,8 @@ class Timeline:
         """The frame that is shown this long after the first one, over and over again."""
         if not self.seconds:
             return int(seconds * self.fps) % len(self.poses)
-        return bisect_right(self.seconds, seconds % (self.seconds[-1] + 1 / self.fps)) - 1
+        last = median(b - a for a, b in pairwise(self.seconds)) if len(self) > 1 else 1.0
+        return bisect_right(self.seconds, seconds % (self.seconds[-1] + last)) - 1
 
     def begins(self, frame: int) -> float:
         """Seconds from the first frame to this one."""
@@ -58,7 +61,7 @@ def split_timelines(capture: Capture, avatar: Avatar | None) -> list[Timeline]:
             poses = tuple(frame_pose(f, capture, avatar, f.frame_index in trained) for f in ordered)
             labels = tuple(str(frame.frame_index) for frame in ordered)
             taken = capture.seconds_of(sorted(by_index))
-            seconds = () if capture.seconds is None else tuple((taken - taken[0]).tolist())
+            seconds = tuple((taken - taken[0]).tolist())
             found.append(Timeline(f"capture: {split}", poses, capture.fps, labels, seconds))
     return found
 
@@ -68,7 +71,7 @@ def frame_pose(frame: Frame, capture: Capture, avatar: Avatar | None, trained: b
     """A frame's pose, corrected as evaluation corrects it."""
     pose, translation = frame.pose, frame.translation
     if avatar is not None:
-        pose, translation = avatar.refined_pose(frame.frame_index, pose, translation, NEAR * capture.fps)
+        pose, translation = avatar.refined_pose(frame.frame_index, pose, translation, NEAR, capture.second)
     return BodyPose(pose.detach().cpu(), translation.detach().cpu(), frame, trained)
 
 

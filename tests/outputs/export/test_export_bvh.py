@@ -77,6 +77,17 @@ def test_missing_frames_are_interpolated() -> None:
     assert np.allclose(middle.magnitude(), whole.magnitude() / 2, atol=1e-5)
 
 
+def test_frames_taken_at_a_varying_rate_are_sampled_at_the_usual_one() -> None:
+    clip = random_clip(frames=40, fps=10)
+    seconds = np.cumsum([0.0, *np.tile([0.1, 0.1, 0.001, 0.13], 10)[:39]]).astype(np.float32)
+    even = evenly_spaced(replace(clip, times=seconds))
+    gaps = np.diff(even.times)
+    assert np.allclose(gaps, gaps[0], rtol=1e-3)
+    assert 0.09 < gaps[0] < 0.11
+    assert (even.times[0], even.times[-1]) == (seconds[0], seconds[-1])
+    assert np.allclose(even.poses[[0, -1]], clip.poses[[0, -1]], atol=1e-5)
+
+
 def test_character_without_motion_is_refused(tmp_path) -> None:
     with pytest.raises(TwofoldError, match="holds a motion"):
         write_bvh(replace(small_character(texture=0), clips=()), tmp_path / "a.bvh", ExportOptions())

@@ -20,8 +20,8 @@ WEIGHED = 60
 
 def capture_clip(baked: Baked, name: str = "capture", weighed: int = WEIGHED) -> Animation:
     """The training motion in the capture's world, with the learned corrections of its poses; see `motion_clip`."""
-    times = sorted({frame.frame_index for frame in baked.capture.train})
-    return _clip(baked, name, training_poses(baked.capture), baked.capture.seconds_of(times), weighed)
+    taken = baked.capture.seconds_of(sorted({frame.frame_index for frame in baked.capture.train}))
+    return _clip(baked, name, training_poses(baked.capture), taken - taken[0], weighed)
 
 
 def motion_clip(baked: Baked, motion: Motion, weighed: int = WEIGHED) -> Animation:
@@ -59,9 +59,9 @@ def _clip(baked: Baked, name: str, frames: Sequence[Pose], times: np.ndarray, we
         places.append((posed.body.joints[0] - shape.skin.rest.joints[0]).cpu().numpy())
         if index in asked:
             weights[index] = shape.weights_at(avatar, posed, baked.config.branch).cpu().numpy()
-    rows, given = np.arange(len(frames)), sorted(weights)
+    given = sorted(weights)
     table = np.stack([weights[index] for index in given])
-    between = [np.interp(rows, given, table[:, target]) for target in range(table.shape[1])]
+    between = [np.interp(times, times[given], table[:, target]) for target in range(table.shape[1])]
     shown = np.stack(between, 1).astype(np.float32) if between else None
     return Animation(name, times.astype(np.float32), np.stack(poses), np.stack(places), shown)
 

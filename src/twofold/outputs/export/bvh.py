@@ -31,12 +31,11 @@ def write_bvh(character: Character, path: Path, options: ExportOptions) -> None:
 
 
 def evenly_spaced(clip: Animation) -> Animation:
-    """The clip at its smallest frame distance throughout; rotations by slerp, translations linear."""
+    """The clip at its usual (median) frame distance throughout; rotations by slerp, translations linear."""
     if len(clip.times) < 3 or np.allclose(np.diff(clip.times), clip.times[1] - clip.times[0], rtol=1e-3):
         return clip
-    step = float(np.diff(clip.times).min())
-    count = round((float(clip.times[-1]) - float(clip.times[0])) / step) + 1
-    times = np.minimum(clip.times[0] + step * np.arange(count), clip.times[-1])
+    begun, ended = float(clip.times[0]), float(clip.times[-1])
+    times = np.linspace(begun, ended, round((ended - begun) / float(np.median(np.diff(clip.times)))) + 1)
     turned = [Slerp(clip.times, Rotation.from_rotvec(clip.poses[:, j]))(times).as_rotvec() for j in range(24)]
     places = [np.interp(times, clip.times, clip.translations[:, axis]) for axis in range(3)]
     dtype = clip.poses.dtype
