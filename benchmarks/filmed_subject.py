@@ -102,12 +102,24 @@ def tripod(distance: float, pitch: float, focal: float) -> Camera:
     return Camera(rigid_transform(down, shift), lens, height, width)
 
 
-def film(name: str, seed: int, folder: Path) -> tuple[Camera, Tensor]:
-    """Images of an act in a folder, where they are missing; the camera, and the joints in its axes, metres."""
+def scene(name: str, seed: int) -> tuple[Performer, Camera]:
+    """Who does an act before which camera."""
     random, act = np.random.default_rng(seed), ACTS[name]
     person = staged(cast(seed, 4, 4), act, float(random.uniform(-50, 50)))
     distance = float(random.uniform(3.2, 4.4))
-    camera = tripod(distance, act.pitch, float(random.uniform(0.8, 1.0)) * max(SIZE) * distance / 4.4)
+    return person, tripod(distance, act.pitch, float(random.uniform(0.8, 1.0)) * max(SIZE) * distance / 4.4)
+
+
+def true_masks(name: str, seed: int) -> list[np.ndarray]:
+    """How much of each pixel the subject covers, 0..255, for each image of `film`."""
+    person, camera = scene(name, seed)
+    covers = [photograph(person, perform(person, t), camera, 2)[1] for t in range(FRAMES)]
+    return [np.rint(255 * cover.clip(0, 1)).astype(np.uint8) for cover in covers]
+
+
+def film(name: str, seed: int, folder: Path) -> tuple[Camera, Tensor]:
+    """Images of an act in a folder, where they are missing; the camera, and the joints in its axes, metres."""
+    person, camera = scene(name, seed)
     folder.mkdir(parents=True, exist_ok=True)
     behind = room(camera, seed)
     for t in range(FRAMES):

@@ -122,3 +122,14 @@ def test_a_clip_is_refined_in_its_files(files):
     assert 1 - mean_overlap(after, truths) < 0.5 * (1 - mean_overlap(before, truths))
     assert done == sorted(done)
     assert done[-1] == 1
+
+
+def test_a_second_pass_begins_at_the_outline_of_the_first(files):
+    images, masks, before, truths = files
+    overlaps = []
+    for passes in (1, 2):
+        for path, mask in zip(masks, before, strict=True):
+            Image.fromarray(mask).save(path)
+        refine_clip(images, masks, lambda path, mask: Image.fromarray(mask).save(path), passes=passes)
+        overlaps.append(mean_overlap([np.asarray(Image.open(path)) for path in masks], truths))
+    assert overlaps[1] > overlaps[0] + 0.001
