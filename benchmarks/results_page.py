@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks import sharpness_section, variants_section
+from benchmarks import masks_section, sharpness_section, variants_section
 from benchmarks.methods_section import schedules, side_by_side
 from benchmarks.study_section import against_methods, answer, section
 
@@ -86,6 +86,7 @@ def results_page(results: dict[str, Any]) -> str:
         + _quality(_named(results, "quality-")),
         *sharpness_section.section(results, _table),
         *_completions(_named(results, "completion-", "")),
+        *_single(results, "masks", lambda result: masks_section.section(result, _table)),
         PICTURES,
     ]
     return "\n".join(part.rstrip() + "\n" for part in parts)
