@@ -15,13 +15,14 @@ def section(result: Mapping[str, Any], table: Table) -> str:
     rows.append(("mean", *(f"{mean(row[kind] for row in acts.values()):.4f}" for kind in KINDS)))
     text = (
         "Synthetic subjects before a room, filmed by a still camera (24 images of 480 x 640 each): IoU of masks with "
-        "the true outline. The estimator's masks, and refined by the background ([how](prepare.md#masks)) in one or more "
-        "passes; `prepare` makes two. `python -m benchmarks.masks`."
+        "the true outline. The estimator's masks, and refined by the background ([how](prepare.md#masks)) in one or "
+        "more passes; `prepare` makes two. `python -m benchmarks.masks`."
     )
     avatars = [
         f"An avatar of the act {act}, trained on the masks of two passes ({row['passes_2']:.3f}) for "
         f"{result['avatar_steps']:,} steps, has silhouettes of {row['avatar']:.3f} in the poses of its training, "
-        f"{row['avatar_refined']:.3f} refined like masks: its fitted poses are off by more than the masks are, so masks are not taken from it."
+        f"{row['avatar_refined']:.3f} refined like masks: its fitted poses are off by more than the masks are, so masks "
+        "are not taken from it."
         for act, row in acts.items()
         if "avatar" in row and row["avatar_refined"] < row["passes_2"]
     ]
