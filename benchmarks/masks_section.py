@@ -21,8 +21,8 @@ def section(result: Mapping[str, Any], table: Table) -> str:
     avatars = [
         f"An avatar of the act {act}, trained on the masks of two passes ({row['passes_2']:.3f}) for "
         f"{result['avatar_steps']:,} steps, has silhouettes of {row['avatar']:.3f} in the poses of its training, "
-        f"{row['avatar_refined']:.3f} refined like masks: its fitted poses are off by more than the masks are, so masks "
-        "are not taken from it."
+        f"{row['avatar_refined']:.3f} refined like masks: its fitted poses are off by more than the masks are, so "
+        "masks are not taken from it."
         for act, row in acts.items()
         if "avatar" in row and row["avatar_refined"] < row["passes_2"]
     ]
