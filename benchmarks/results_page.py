@@ -107,12 +107,12 @@ def readme_table(results: dict[str, Any]) -> str:
                 rows["The balancing man, poses and masks prepared elsewhere"],
             ),
             (
-                "Training step, the paper's network sizes, 1,728 rays",
+                f"Training step, the paper's network sizes, 1,728 rays (commit {two['commit']})",
                 f"{_s(two['fast'])}, {_ratio(two):.0f} times faster than the reference form ({_s(two['reference'])}); "
                 f"on one core {_s(one['fast'])}, {_ratio(one):.0f} times",
             ),
             (
-                "Image of 512 x 512",
+                f"Image of 512 x 512 (commit {image['commit']})",
                 f"recipe `quick` {_s(image['quick']['512'])}, the paper's networks {_s(image['fast']['512'])}; "
                 f"on one core {_s(picture_one['quick']['512'])} and {_s(picture_one['fast']['512'])}",
             ),
