@@ -192,7 +192,8 @@ def _provenance(results: Iterable[dict[str, Any]]) -> str:
     many = list(results)
     commits = sorted({str(result["commit"]) for result in many})
     processors = sorted({str(result["machine"]["processor"]) for result in many})
-    return f"Commit{'s' * (len(commits) > 1)} {' and '.join(commits)}, {' and '.join(processors)}."
+    notes = [result["note"] for result in many if "note" in result]
+    return " ".join([f"Commit{'s' * (len(commits) > 1)} {' and '.join(commits)}, {' and '.join(processors)}.", *notes])
 
 
 def _captures(captures: dict[str, Any]) -> str:

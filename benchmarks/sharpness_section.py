@@ -37,6 +37,7 @@ def section(results: Mapping[str, Any], table: Table) -> list[str]:
         "error on average. `python -m benchmarks.sharpness`."
     )
     when = f"Before: commit {before['commit']}; after: commit {after['commit']}; {after['machine']['processor']}."
+    when += f" {after['note']}" if "note" in after else ""
     return [f"## Sharpness\n\n{text}\n\n{table(('Subject', 'Images', 'Before', 'After'), rows)}\n{when}\n"]
 
 
