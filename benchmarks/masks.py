@@ -31,6 +31,7 @@ from twofold.images import read_grey, read_rgb
 from twofold.kernels.runtime import tune_process
 from twofold.methods.table import chosen_recipe
 from twofold.metrics.image import silhouette_iou
+from twofold.prepare.detect import mask_refinement
 from twofold.prepare.detect.mask_refinement import background_plate, refine_clip, refined_mask
 from twofold.training import loop
 
@@ -86,10 +87,10 @@ def measured(act: str, seed: int, scratch: Path, steps: int) -> dict[str, float]
     every = true_masks(act, seed)
     truths = [every[frame.frame_index] for frame in frames]
     row = {"estimated": mean_iou([read_grey(frame.mask_file) for frame in frames], truths)}
-    for passes in PASSES:
-        row[f"passes_{passes}"] = mean_iou(refined(frames, scratch / act / f"passes{passes}", passes), truths)
+    by_passes = {passes: refined(frames, scratch / act / f"passes{passes}", passes) for passes in PASSES}
+    row |= {f"passes_{passes}": mean_iou(masks, truths) for passes, masks in by_passes.items()}
     if steps:
-        for frame, mask in zip(frames, refined(frames, scratch / act / "taken", 2), strict=True):
+        for frame, mask in zip(frames, by_passes[mask_refinement.PASSES], strict=True):
             save(frame.mask_file, mask)
         plain, sharp = silhouettes(read_capture(out), scratch / act / "run", steps)
         row |= {"avatar": mean_iou(plain, truths), "avatar_refined": mean_iou(sharp, truths)}

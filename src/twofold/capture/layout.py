@@ -318,6 +318,10 @@ def _read_body(folder: Path, faults: list[str]) -> Body | None:
         return None
 
 
+_OPTIONAL = ("true_poses", "true_translations", "seconds")
+"""Arrays that `motion.npz` need not have."""
+
+
 def _read_motion(
     folder: Path, body: Body | None, faults: list[str]
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
@@ -335,7 +339,7 @@ def _read_motion(
     read: dict[str, Tensor] = {}
     for name, shape in shapes.items():
         if name not in arrays:
-            if not name.startswith("true_") and name != "seconds":
+            if name not in _OPTIONAL:
                 faults.append(f"{MOTION} lacks {name}.")
             continue
         array, words = arrays[name], " x ".join("any" if n is None else str(n) for n in shape)
@@ -355,7 +359,7 @@ def _read_motion(
                 f"{MOTION}: seconds should increase from frame to frame; not so at times {spans(back.tolist())}."
             )
         elif name == "seconds":
-            read[name] = torch.as_tensor(array.astype(np.float64) - (float(array[0]) if moments else 0.0))
+            read[name] = torch.as_tensor(array.astype(np.float64) - array[:1].astype(np.float64))
         else:
             read[name] = torch.as_tensor(array.astype(np.float32))
     betas = read.get("betas")

@@ -19,6 +19,8 @@ Item = TypeVar("Item")
 
 SPLITS = ("train", "novel_view", "novel_pose")
 """Training images; the same frames from other cameras; other frames."""
+VIDEO_LENGTH = 16
+"""Images of the video whose consistency is measured."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +67,6 @@ class Frame:
         if self.ignored_file is None:
             return torch.zeros(self.camera.height, self.camera.width, dtype=torch.bool)
         return torch.from_numpy(read_grey(self.ignored_file) > 127)
-
-
-VIDEO_LENGTH = 16
-"""Images of the video whose consistency is measured."""
 
 
 @dataclass(frozen=True)

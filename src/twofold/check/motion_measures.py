@@ -13,7 +13,7 @@ from torch import Tensor
 
 from twofold.body.skeleton import JOINT_NAMES, joint_transforms
 from twofold.capture.types import Frame, spread
-from twofold.geometry.accelerations import SHORTEST
+from twofold.geometry.accelerations import limited_gaps
 from twofold.geometry.rotations import axis_angle_to_matrix
 from twofold.prepare.turning import arc, camera_directions, sides_seen
 
@@ -178,8 +178,7 @@ def _jumps(
     bad = np.zeros(count, bool)
     if count < 3:
         return bad, np.empty(0, np.float32)
-    # Time stamps are rounded: two frames are never closer than a share of the usual distance.
-    gaps = np.maximum(np.diff(seconds), SHORTEST * (seconds[-1] - seconds[0]) / (count - 1))
+    gaps = limited_gaps(np.diff(seconds))
     before, after = gaps[:-1], gaps[1:]
     weight = torch.as_tensor(after / (before + after), dtype=joints.dtype)[:, None, None]
     away = (joints[1:-1] - weight * joints[:-2] - (1 - weight) * joints[2:]).norm(dim=-1).numpy()

@@ -1,10 +1,20 @@
 """Accelerations of what was seen at even or uneven times."""
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
 SHORTEST = 0.25
 """Share of the mean gap between frames below which two of them count as that far apart: time stamps are rounded."""
+
+
+def limited_gaps(gaps: Float[np.ndarray, "g"]) -> Float[np.ndarray, "g"]:
+    """Times between frames, seconds, none below `SHORTEST` times their mean: time stamps are rounded.
+
+    >>> limited_gaps(np.array([1.0, 0.0, 2.0])).tolist()
+    [1.0, 0.25, 2.0]
+    """
+    return np.maximum(gaps, SHORTEST * gaps.mean()) if len(gaps) else gaps
 
 
 def accelerations(

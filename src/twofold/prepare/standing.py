@@ -16,7 +16,7 @@ from twofold.body.balance import center_of_mass
 from twofold.body.leg_ik import ANKLES, HIPS, TOES, knee_bends
 from twofold.body.motion import leg_length
 from twofold.body.skeleton import joint_transforms
-from twofold.geometry.accelerations import SHORTEST
+from twofold.geometry.accelerations import limited_gaps
 
 UPRIGHT = 0.5
 """Smallest mean cosine between the body's own up and the world's y axis at which that axis counts as vertical."""
@@ -128,9 +128,8 @@ def standing_facts(
     lowest = feet[..., 1].mean(2).amin(1)
     following = torch.diff(times) == 1
     slower = (places[1:] - places[:-1]).norm(dim=-1).amin(1)[following]
-    gaps = torch.as_tensor(np.diff(seconds[times.numpy()]), dtype=slower.dtype)[following]
-    # Time stamps are rounded: two frames are never closer than a share of the usual distance.
-    slower = slower / (gaps.clamp_min(SHORTEST * float(gaps.mean())) if len(gaps) else gaps)
+    gaps = limited_gaps(np.diff(seconds[times.numpy()])[following.numpy()])
+    slower = slower / torch.as_tensor(gaps, dtype=slower.dtype)
     upward = torch.nn.functional.normalize(placed[:, 12] - placed[:, 0], dim=-1)[:, 1]
     floor = float(torch.quantile(lowest, 0.1))
     return StandingFacts(

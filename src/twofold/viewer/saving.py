@@ -93,8 +93,8 @@ def save_glb(folder: Path, viewed: Viewed, state: SceneState, meshes: Meshes) ->
     back = viewed.turn.T
     line = state.timeline
     clips = [_clip(character, line.name, line.poses, [line.begins(frame) for frame in range(len(line))])]
-    if meshes.baked is not None and state.timeline.name == "capture: train":
-        clips = [capture_clip(meshes.baked, state.timeline.name)]
+    if meshes.baked is not None and line.name == "capture: train":
+        clips = [capture_clip(meshes.baked, line.name)]
     if state.edited:
         clips.append(_clip(character, "edited pose", (state.pose,), [0.0]))
     standing = tuple(grounded(turned(clip, back, character.joints[0]), character) for clip in clips)

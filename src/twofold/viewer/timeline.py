@@ -2,6 +2,7 @@
 
 from bisect import bisect_right
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from statistics import median
 
@@ -42,8 +43,12 @@ class Timeline:
         """The frame that is shown this long after the first one, over and over again."""
         if not self.seconds:
             return int(seconds * self.fps) % len(self.poses)
-        last = median(b - a for a, b in pairwise(self.seconds)) if len(self) > 1 else 1.0
-        return bisect_right(self.seconds, seconds % (self.seconds[-1] + last)) - 1
+        return bisect_right(self.seconds, seconds % self._length) - 1
+
+    @cached_property
+    def _length(self) -> float:
+        """Seconds until the first frame comes again; the last one stays as long as frames usually do."""
+        return self.seconds[-1] + (median(b - a for a, b in pairwise(self.seconds)) if len(self) > 1 else 1.0)
 
     def begins(self, frame: int) -> float:
         """Seconds from the first frame to this one."""
