@@ -75,7 +75,7 @@ def console() -> Console:
 
 
 @contextmanager
-def _when_continued(restart: Callable[[], None]) -> Generator[None]:
+def _when_continued(restart: Callable[[], None]) -> Generator[None, None, None]:
     """Calls a function whenever the stopped process goes on (`fg`, SIGCONT), where there is such a signal."""
     if not hasattr(signal, "SIGCONT") or threading.current_thread() is not threading.main_thread():
         yield

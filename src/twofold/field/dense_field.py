@@ -1,5 +1,6 @@
 """What fields of dense networks share: how points and answers pass in and out, and who takes the gradients."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Literal
 
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from twofold.field.output import FieldOutput
 
 
-class DenseField(nn.Module):
+class DenseField(nn.Module, ABC):
     """A field of dense networks in canonical space. What differs is `_evaluate`, `_distance_and_gradient` and `sdf`.
 
     Gradients of the distance by the point are "analytic", a reverse pass written out, or of "autograd", the plain form:
@@ -21,21 +22,21 @@ class DenseField(nn.Module):
         super().__init__()
         self.analytic = gradients == "analytic"
 
+    @abstractmethod
     def _evaluate(
         self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"], to_observation: Float[Tensor, "S 3 3"] | None
     ) -> FieldOutput:
         """Distance, colour and gradient at points that require gradients where `autograd` takes them."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _distance_and_gradient(
         self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
     ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
         """The distance and its gradient at points that require gradients where `autograd` takes them."""
-        raise NotImplementedError
 
+    @abstractmethod
     def sdf(self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> Float[Tensor, "S"]:
         """The distance that `forward` gives, alone, metres."""
-        raise NotImplementedError
 
     def forward(
         self,
