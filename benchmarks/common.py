@@ -7,7 +7,6 @@ import os
 import platform
 import resource
 import statistics
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ import torch
 
 from twofold.capture.folder import read_capture
 from twofold.capture.types import Capture
+from twofold.provenance import commit
 from twofold.studio.generate import StudioConfig, make_studio
 
 RESULTS = Path(__file__).parent / "results"
@@ -39,20 +39,6 @@ def machine() -> dict[str, object]:
         "torch": torch.__version__,
         "load_before": os.getloadavg()[0],
     }
-
-
-def commit() -> str | None:
-    """The commit that runs, with a plus where sources were changed since; None outside of a clone."""
-
-    def told(*words: str) -> str:
-        call = subprocess.run(("git", *words), cwd=RESULTS.parents[1], capture_output=True, text=True, timeout=10)
-        return call.stdout.strip()
-
-    try:
-        head = told("rev-parse", "--short=7", "HEAD")
-        return head + "+" * bool(told("status", "--porcelain", "--", "src", "benchmarks/*.py")) if head else None
-    except (OSError, subprocess.SubprocessError):
-        return None
 
 
 def studio_capture(size: int, frames: int = 10, cameras: int = 2, seed: int = 0) -> Capture:
@@ -84,7 +70,7 @@ def peak_memory_gb() -> float:
 
 
 def store(name: str, result: dict[str, object]) -> None:
-    """Writes benchmarks/results/NAME.json, with the machine and the commit, and prints it."""
+    """Writes benchmarks/results/NAME.json, with the machine and the commit (or that of the result), and prints it."""
     RESULTS.mkdir(exist_ok=True)
     text = json.dumps({"machine": machine(), "commit": commit(), **result}, indent=2)
     (RESULTS / f"{name}.json").write_text(text + "\n", encoding="utf-8")

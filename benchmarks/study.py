@@ -123,6 +123,20 @@ def _require_equal(study: dict[str, Any], other: dict[str, Any], keys: tuple[str
             raise ValueError(f"{key} is {one!r} in one table, {two!r} in the other")
 
 
+def _commit(cells: list[dict[str, Any]]) -> dict[str, str]:
+    """The commit that made all cells, for `store`; nothing where they do not agree or do not say.
+
+    >>> _commit([{"made_with": "0.1.0 at f22924d"}] * 2)
+    {'commit': 'f22924d'}
+    >>> _commit([{"made_with": "0.1.0 at f22924d"}, {"made_with": None}])
+    {}
+    """
+    programs = {cell.get("made_with") for cell in cells}
+    (program,) = programs if len(programs) == 1 else ("",)
+    head = (program or "").partition(" at ")[2]
+    return {"commit": head} if head else {}
+
+
 def main() -> None:
     """Collects and stores."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -140,7 +154,7 @@ def main() -> None:
         study = with_full_model(study, collected(arguments.full_of))
     for table in arguments.rows_of:
         study = with_rows_of(study, collected(table))
-    store(f"study-{arguments.name or study['experiment']}", study)
+    store(f"study-{arguments.name or study['experiment']}", {**_commit(study["cells"]), **study})
 
 
 if __name__ == "__main__":

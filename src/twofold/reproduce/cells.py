@@ -23,6 +23,7 @@ from twofold.files import made_folder, write_json
 from twofold.inputs import read_json
 from twofold.kernels.runtime import tune_process
 from twofold.methods.table import recipe_from_dict, recipe_to_dict
+from twofold.provenance import program
 from twofold.recipe import Recipe
 from twofold.reproduce.measuring import Measures, measure_avatar
 from twofold.reproduce.sources import FolderSource, Source, StudioSource
@@ -204,7 +205,7 @@ def train_and_measure(folder: Path) -> None:
     )
     known = read_json(folder / RATE) if (folder / RATE).is_file() else {}
     seconds = (known if isinstance(known, dict) else {}) | {"measuring": time.monotonic() - measuring}
-    about = {"recipe": cell.recipe.name, "seed": cell.recipe.seed, "subject": cell.source.name}
+    about = {"recipe": cell.recipe.name, "seed": cell.recipe.seed, "subject": cell.source.name, "made_with": program()}
     write_json(folder / RESULTS, about | {"seconds": seconds, "measures": asdict(cell.measures)} | found)
     note(1.0, "done", force=True)
 

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -93,7 +94,8 @@ def fill(name: str, planned: Sequence[PlannedCell], out: Path, about: dict[str, 
             lines.append(TableLine(shown, row, tuple(values), paper))
     cells = [
         {"key": p.cell.key, "row": p.row.label, "subject": p.subject, "seed": p.seed, "recipe": p.cell.recipe.name,
-         "state": "done" if results[p.cell.key] is not None else p.cell.failure(out) or "not done"}
+         "state": "done" if results[p.cell.key] is not None else p.cell.failure(out) or "not done",
+         "made_with": (results[p.cell.key] or {}).get("made_with")}
         for p in planned
     ]  # fmt: skip
     missing = [cell for cell in cells if cell["state"] != "done"]
@@ -103,6 +105,7 @@ def fill(name: str, planned: Sequence[PlannedCell], out: Path, about: dict[str, 
         notes += [
             f"{c['row']}, {c['subject']}, seed {c['seed']}: {c['state']}" for c in missing if c["state"] != "not done"
         ]
+    notes += _programs(cells)
     lacking = {v.note for line in lines for v in line.values if v.note}
     notes += [f"n/a: {note.removeprefix('n/a ').strip('()')}." for note in sorted(lacking)]
     return FilledTable(name, experiment.title, experiment.columns, tuple(lines), tuple(notes), tuple(cells), about)
@@ -231,6 +234,25 @@ def as_json(table: FilledTable) -> dict[str, Any]:
         "experiment": table.name, "title": table.title, "about": table.about, "columns": columns, "lines": lines,
         "notes": list(table.notes), "cells": list(table.cells),
     }  # fmt: skip
+
+
+def _programs(cells: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A note where cells were made with different versions of the program: they are kept by their settings alone.
+
+    >>> _programs([{"state": "done", "made_with": "0.1.0"}] * 2)
+    []
+    >>> (note,) = _programs([{"state": "done", "made_with": "0.1.0"}, {"state": "done", "made_with": "0.2.0"}])
+    >>> note.partition(";")[0]
+    'Cells were made with different versions of twofold: 0.1.0 (1), 0.2.0 (1)'
+    """
+    counts = Counter(cell["made_with"] or "an unknown one" for cell in cells if cell["state"] == "done")
+    if len(counts) < 2:
+        return []
+    told = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
+    return [
+        f"Cells were made with different versions of twofold: {told}; remove folders of cells (cells/KEY, by the keys "
+        "in the table's JSON) to make these anew."
+    ]
 
 
 def image_rows(planned: Sequence[PlannedCell], out: Path) -> list[dict[str, Any]]:

@@ -2,12 +2,9 @@
 
 import json
 import os
-import platform
 import re
 import shutil
-import sys
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +24,7 @@ from twofold.methods.base import Avatar
 from twofold.methods.subject import Subject
 from twofold.methods.table import learning_rates, recipe_from_dict, recipe_to_dict
 from twofold.npz import read_npz
+from twofold.provenance import made_with
 from twofold.recipe import Recipe
 from twofold.training.camera_colors import CameraColors, LearnedResponse, load_camera_colors
 from twofold.training.clock import Spent
@@ -98,13 +96,9 @@ def start_folder(
         TwofoldError: see `require_free`; or the disk refuses.
     """
     require_free(folder)
-    packages = {name: metadata.version(name) for name in ("torch", "numpy", "scipy", "safetensors")}
     about = {
-        "twofold": __version__,
-        "python": sys.version.split()[0],
-        "machine": platform.platform(),
+        **made_with(),
         "threads": torch.get_num_threads(),
-        "packages": packages,
         "capture": str(capture.resolve()),
         **_body_file(capture),
         "notes": list(notes),
