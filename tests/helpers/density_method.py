@@ -12,7 +12,8 @@ from twofold.field.encoding import fourier_encoding
 from twofold.geometry.cameras import clip_to_box
 from twofold.losses import mask, reconstruction
 from twofold.methods import table
-from twofold.methods.base import EVALUATION, Avatar, MethodConfig, ParameterGroup, PosedAvatar, Rendering
+from twofold.methods.base import EVALUATION, Avatar, MethodConfig, PosedAvatar, Rendering
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.methods.table import Method
 from twofold.recipe import PixelConfig, Recipe, TrainingConfig
 from twofold.sampling.error_bounded import uniform_depths

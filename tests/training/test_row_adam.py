@@ -8,7 +8,7 @@ from small_recipes import CASES
 
 from twofold.methods.subject import Subject
 from twofold.training import loop
-from twofold.training.row_adam import RowAdam
+from twofold.training.row_adam import RowAdam, signal_to_noise
 
 
 def trained(person, recipe, folder, steps, monkeypatch, rows=True, resume=False):
@@ -69,10 +69,10 @@ def test_gradients_are_ordinary_ones_with_clipping_and_after_training(person, re
     assert avatar.field.high_grid.row_gradient is None
 
 
-def visited(rates, gradients, start):
+def visited(rates, gradients, start, shrinkage=0.0):
     """Frames' corrections trained by visits, one frame a step."""
     table = torch.nn.Parameter(start.clone())
-    groups = [{"params": [table], "lr": rates, "name": "pose", "by_visit": True}]
+    groups = [{"params": [table], "lr": rates, "name": "pose", "by_visit": True, "shrinkage": shrinkage}]
     optimizer = RowAdam(groups, {}, (0.9, 0.99), 1e-15)
     for frame, gradient in gradients:
         table.grad = torch.zeros_like(table)
@@ -125,3 +125,64 @@ def test_quick_and_vid2avatar_ask_for_visits_of_poses_where_the_recipe_does(pers
             avatar = replace(method, pose=replace(method.pose, averages=averages)).build(Subject.of(person), 0)
             asked = {group.name for group in avatar.parameter_groups() if group.by_visit}
             assert asked == ({"pose"} if averages == "visits" else set())
+
+
+def noise(generator, rows, mean):
+    """Gradients of frames in turn: equal means with noise of unit size."""
+    return [(step % rows, mean + torch.randn(23, 3, generator=generator)) for step in range(rows * 30)]
+
+
+@pytest.mark.parametrize(("mean", "low", "high"), [(0.0, 0.8, 1.2), (1.0, 6.0, 18.0)])
+def test_signal_to_noise_is_one_for_noise_and_more_where_visits_agree(mean, low, high):
+    shown = noise(torch.Generator().manual_seed(2), 16, mean)
+    _, optimizer = visited(0.001, shown, torch.zeros(16, 23, 3), shrinkage=1.0)
+    ratio = optimizer.state_dict()["state"][0]["signal_to_noise"]
+    assert ratio.shape == (1, 23, 1)
+    assert low < ratio.mean() < high
+
+
+@pytest.mark.parametrize("visits", [1, 2, 5, 40])
+def test_signal_to_noise_is_that_of_weights_written_out(visits):
+    """The variance of Adam's mean by its weights one by one, in double precision."""
+    beta = 0.9
+    generator = torch.Generator().manual_seed(visits)
+    gradients = torch.randn(visits, 7, 5, 3, generator=generator, dtype=torch.float64)
+    weights = torch.tensor([beta ** (visits - 1 - i) for i in range(visits)], dtype=torch.float64)
+    weights = weights / weights.sum()
+    mean = torch.einsum("v,vrjk->rjk", weights, gradients)
+    step = mean / gradients.square().mean(0).sqrt()
+    expected = (step.square() / weights.square().sum()).mean((0, 2))
+    found = signal_to_noise(step, torch.full((7,), float(visits), dtype=torch.float64), beta)
+    torch.testing.assert_close(found[0, :, 0], expected)
+
+
+def test_shrinkage_stops_noise_and_keeps_most_of_a_signal():
+    start = torch.zeros(16, 23, 3)
+    moved = {}
+    for mean in (0.0, 1.0):
+        for shrinkage in (0.0, 1.5):
+            shown = noise(torch.Generator().manual_seed(3), 16, mean)
+            moved[mean, shrinkage] = visited(0.001, shown, start, shrinkage)[0].square().mean().sqrt()
+    assert moved[0.0, 1.5] < 0.1 * moved[0.0, 0.0]
+    assert moved[1.0, 1.5] > 0.5 * moved[1.0, 0.0]
+
+
+def test_each_joint_shrinks_by_its_own_noise():
+    shown = noise(torch.Generator().manual_seed(4), 16, 0.0)
+    for _, gradient in shown:
+        gradient[5] += 1.0
+    table, _ = visited(0.001, shown, torch.zeros(16, 23, 3), 1.5)
+    size = table.square().mean((0, 2)).sqrt()
+    assert size[5] > 10 * size[[joint for joint in range(23) if joint != 5]].max()
+
+
+def test_resumed_shrinkage_repeats_the_steps(person, recipe, tmp_path, monkeypatch):
+    pose = replace(recipe.method.pose, averages="visits", shrinkage=0.5, refine_from=0)
+    recipe = replace(recipe, method=replace(recipe.method, pose=pose))
+    whole = trained(person, recipe, tmp_path / "whole", 12, monkeypatch)
+    trained(person, recipe, tmp_path / "parts", 9, monkeypatch)
+    stored = (tmp_path / "parts" / "recipe.json").read_text()
+    (tmp_path / "parts" / "recipe.json").write_text(stored.replace('"steps": 9', '"steps": 12'))
+    parts = trained(person, recipe, tmp_path / "parts", 12, monkeypatch, resume=True)
+    assert whole["refinement.body"].any()
+    assert torch.equal(whole["refinement.body"], parts["refinement.body"])

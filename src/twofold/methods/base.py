@@ -20,6 +20,7 @@ from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
 from twofold.kernels.row_gradient import RowGradient
 from twofold.methods.camera_response import CameraResponse
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.methods.subject import Subject
 from twofold.metrics.perceptual import LPIPS
 from twofold.recipe import TrainingConfig
@@ -62,25 +63,6 @@ class Stage:
 
     name: str
     training: TrainingConfig
-
-
-@dataclass(frozen=True)
-class ParameterGroup:
-    """Trainable parameters that share a learning rate.
-
-    Attributes:
-        name: for messages.
-        rate: learning rate before schedules.
-        parameters: may be empty.
-        by_visit: whether Adam's means of a row change only in steps that have a gradient for it (see `RowAdam`).
-        decay_power: power of what the schedule multiplies all rates with; 2 lets this one fall twice as fast.
-    """
-
-    name: str
-    rate: float
-    parameters: list[nn.Parameter]
-    by_visit: bool = False
-    decay_power: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from torch import Tensor
 from twofold.config import require_within
 from twofold.field.bone_boxes import RIGID_PARTS
 from twofold.losses import box_assignment, box_volumes
-from twofold.methods.base import Batch, MethodConfig, Mode, ParameterGroup, PosedAvatar, Rendering
+from twofold.methods.base import Batch, MethodConfig, Mode, PosedAvatar, Rendering
 from twofold.methods.boxed_avatar import BoxedAvatar
 from twofold.methods.boxed_config import (
     BoxedPose,
@@ -21,6 +21,7 @@ from twofold.methods.boxed_config import (
     short_training,
 )
 from twofold.methods.local_radiance import POSE_OCTAVES, LocalRadiance, inside_rigid
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.methods.subject import Subject
 from twofold.recipe import Recipe
 

@@ -17,8 +17,9 @@ from twofold.field.output import FieldOutput
 from twofold.geometry.surfaces import vertex_normals
 from twofold.kernels.row_gradient import RowGradient
 from twofold.kernels.runtime import compiled_methods
-from twofold.methods.base import Batch, Mode, ParameterGroup, Rendering
+from twofold.methods.base import Batch, Mode, Rendering
 from twofold.methods.factorized_config import RateConfig
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.methods.pixel_levels import following
 from twofold.methods.skinned import Posed, SkinnedAvatar
 from twofold.methods.skinned_config import SkinnedConfig

@@ -12,7 +12,7 @@ from twofold.config import require_within
 from twofold.field.bone_boxes import RIGID_PARTS, initial_half_sizes
 from twofold.geometry.cameras import Rays
 from twofold.losses import background, box_assignment, box_volumes
-from twofold.methods.base import Batch, MethodConfig, Mode, ParameterGroup, PosedAvatar, Rendering, Stage
+from twofold.methods.base import Batch, MethodConfig, Mode, PosedAvatar, Rendering, Stage
 from twofold.methods.boxed_avatar import CODE_SPREAD, BoxedAvatar
 from twofold.methods.boxed_config import (
     BoxedPose,
@@ -23,6 +23,7 @@ from twofold.methods.boxed_config import (
     short_training,
 )
 from twofold.methods.local_radiance import POSE_OCTAVES, LocalRadiance, inside_rigid
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.methods.point_needs import body_surface, require_points, unseen_parts
 from twofold.methods.point_networks import BETA, PointNetworks, PointWeights, ReadyPoints, surface_positions
 from twofold.methods.subject import Subject

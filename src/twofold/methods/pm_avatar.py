@@ -15,7 +15,7 @@ from twofold.field.pose_modulated import FEATURE_COLUMNS, PoseModulatedField
 from twofold.field.spherical_harmonics import spherical_harmonics
 from twofold.geometry.cameras import Rays
 from twofold.losses import box_volumes
-from twofold.methods.base import Batch, MethodConfig, Mode, ParameterGroup, PosedAvatar, Rendering
+from twofold.methods.base import Batch, MethodConfig, Mode, PosedAvatar, Rendering
 from twofold.methods.boxed_avatar import BoxedAvatar
 from twofold.methods.boxed_config import (
     BoxedPose,
@@ -25,6 +25,7 @@ from twofold.methods.boxed_config import (
     released_training,
     short_training,
 )
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.methods.subject import Subject
 from twofold.recipe import Recipe
 

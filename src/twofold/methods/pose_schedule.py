@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from twofold.config import require_within
+from twofold.config import require, require_within
 from twofold.losses import MAX_STEPS
-from twofold.methods.base import ParameterGroup
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.recipe import scaled_count
 
 
@@ -37,6 +37,9 @@ class PoseConfig:
     averages: Literal["steps", "visits"] = "steps"
     """When Adam's running means of a frame's gradients change: "steps", in all, as in the release; "visits", in steps
     that see the frame, so that what its images say is averaged (ours; see `twofold.training.row_adam`)."""
+    shrinkage: float = 0.0
+    """How often the noise of a joint's gradients is counted when its steps shrink by it; 0 for full steps (ours, with
+    averages of visits; see `twofold.training.row_adam.shrink`)."""
     decay_power: float = 1.0
     """Power of what the schedule multiplies the learning rate of the corrections with; 2 lets it fall twice as fast as
     the others (ours)."""
@@ -59,13 +62,16 @@ class PoseConfig:
             drop=(0, 1),
             refine_from=steps,
             decay_power=(0, 10),
+            shrinkage=(0, 100),
         )
+        require(self.averages == "visits" or not self.shrinkage, "shrinkage needs averages=visits")
 
     def group(self, name: str, rate: float, parameters: list[nn.Parameter]) -> ParameterGroup:
         """A group of a method's parameters; that of the corrections, named "pose", as is asked for here."""
         if name != "pose":
             return ParameterGroup(name, rate, parameters)
-        return ParameterGroup(name, rate, parameters, self.averages == "visits", self.decay_power)
+        by_visit = self.averages == "visits"
+        return ParameterGroup(name, rate, parameters, by_visit, self.decay_power, self.shrinkage)
 
     def scaled(self, factor: float) -> "PoseConfig":
         """The schedule stretched by a factor; zero poses later on keep their share of the epochs."""

@@ -28,7 +28,8 @@ from twofold.geometry.cameras import Rays, clip_to_box, pixel_grid, pixel_rays, 
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle, rigid_inverse
 from twofold.kernels.mlp import MLP
 from twofold.losses import squared_error
-from twofold.methods.base import EVALUATION, Avatar, Batch, Mode, ParameterGroup, PosedAvatar, Rendering
+from twofold.methods.base import EVALUATION, Avatar, Batch, Mode, PosedAvatar, Rendering
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.methods.skeletal_config import Shaded, SkeletalConfig, SkeletalPose, SkeletalRates
 from twofold.methods.subject import Subject
 from twofold.metrics.perceptual import LPIPS

@@ -22,9 +22,10 @@ from twofold.deform.skinning import normal_matrices, to_canonical, vertex_transf
 from twofold.field.output import FieldOutput
 from twofold.geometry.cameras import Rays
 from twofold.geometry.surfaces import nearest_vertices
-from twofold.methods.base import EVALUATION, Avatar, Batch, Mode, ParameterGroup, PosedAvatar, Rendering
+from twofold.methods.base import EVALUATION, Avatar, Batch, Mode, PosedAvatar, Rendering
 from twofold.methods.completion import Completion
 from twofold.methods.loss_terms import loss_terms
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.methods.pose_schedule import condition
 from twofold.methods.skinned_config import CanonicalField, SkinnedConfig, SkinnedPose
 from twofold.methods.subject import Subject, observed_corrections

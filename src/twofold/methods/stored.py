@@ -13,7 +13,7 @@ ABSENT: dict[str, dict[str, object]] = {
     },
     "method.pose": {
         "zero_epochs": 0, "epochs": "moments", "canonical_shape": "refined", "test_shape": "refined",
-        "observed_only": False, "averages": "steps", "decay_power": 1.0,
+        "observed_only": False, "averages": "steps", "decay_power": 1.0, "shrinkage": 0.0,
     },
     "method.losses": {
         "lpips_dropout": 0.0, "lpips_off_box": "black", "s3im_center": 1.5, "eikonal_replacement": True,

@@ -28,7 +28,8 @@ from twofold.geometry.cameras import Rays
 from twofold.geometry.isosurface import extract_surface
 from twofold.geometry.signed_distance import signed_distance
 from twofold.methods.backdrop import require_backdrop
-from twofold.methods.base import EVALUATION, Batch, Mode, ParameterGroup, Rendering
+from twofold.methods.base import EVALUATION, Batch, Mode, Rendering
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.methods.skinned import Posed, SkinnedAvatar
 from twofold.methods.skinned_config import SkinnedConfig
 from twofold.methods.subject import Subject

@@ -4,12 +4,67 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from twofold.kernels.row_gradient import RowGradient, adam_rows
 from twofold.methods.base import Avatar
 from twofold.recipe import TrainingConfig
 from twofold.training.camera_colors import RATE, CameraColors
+
+KNOWN_VISITS = 3
+"""Visits after which a row's mean gradient is compared with its noise."""
+POOLED_VISITS = 64
+"""Visits of all rows over which that comparison is averaged."""
+
+
+def signal_to_noise(
+    step: Float[Tensor, "rows *entries numbers"], visits: Float[Tensor, "rows"], beta: float
+) -> Float[Tensor, "1 *entries 1"]:
+    r"""How much larger rows' mean gradients are than gradients of independent noise would have left them.
+
+    After $n$ visits Adam's mean $\hat m$ weights them by $w_i \propto \beta^{n - i}$, and of noise alone it has the
+    variance $s_n \hat v$, so
+
+    \[ \rho = \operatorname{mean}\Big(\frac{\hat m^2}{s_n \hat v}\Big), \qquad
+    s_n = \sum_i w_i^2 = \frac{1 - \beta}{1 + \beta} \, \frac{1 - \beta^{2n}}{(1 - \beta^n)^2} \]
+
+    over the rows and the last axis is about 1 for noise, and larger where visits agree.
+
+    >>> signal_to_noise(torch.full((2, 3), 0.5), torch.tensor([1.0, 1.0]), 0.9)
+    tensor([[0.2500]])
+
+    Args:
+        step: $\hat m / \sqrt{\hat v}$.
+        visits: of each row, at least one.
+        beta: of the mean.
+    """
+    n = visits.view(-1, *[1] * (step.dim() - 1))
+    noise = (1 - beta) / (1 + beta) * (1 - beta ** (2 * n)) / (1 - beta**n) ** 2
+    return (step.square() / noise).mean((0, -1), keepdim=True)
+
+
+def shrink(
+    step: Float[Tensor, "rows *entries numbers"], ratio: Float[Tensor, "1 *entries 1"], shrinkage: float
+) -> Float[Tensor, "rows *entries numbers"]:
+    r"""Steps shrunk as in Wiener's filter, with the noise counted $c$ times.
+
+    \[ \Delta' = \max\Big(0, 1 - \frac{c}{\rho}\Big) \, \Delta \]
+
+    Gradients of exact poses are noise of the images' rays, and steps of full length would make them worse; those of
+    poses that are off agree from visit to visit.
+
+    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor([[3.0]]), 1.5)
+    tensor([[ 0.5000, -0.5000]])
+    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor([[1.2]]), 1.5)
+    tensor([[0., -0.]])
+
+    Args:
+        step: $\Delta$.
+        ratio: $\rho$ of `signal_to_noise`.
+        shrinkage: $c$.
+    """
+    return step * (1 - shrinkage / ratio.clamp_min(1e-6)).clamp_min(0)
 
 
 class RowAdam(torch.optim.Adam):
@@ -18,6 +73,8 @@ class RowAdam(torch.optim.Adam):
     In groups marked `by_visit` the means of a row's gradients change only in steps that have a gradient for it. A table
     of frames of which each step sees one needs that: else the mean of a frame's gradients has long decayed when the
     frame comes again, each gradient moves it by ten rates whatever its size, and noise is never averaged.
+
+    Steps of such a table may shrink where its gradients are noise (`shrink`).
     """
 
     def __init__(
@@ -63,7 +120,23 @@ class RowAdam(torch.optim.Adam):
         first[seen] = beta1 * first[seen] + (1 - beta1) * g
         second[seen] = beta2 * second[seen] + (1 - beta2) * g.square()
         root = (second[seen] / (1 - beta2**times)).sqrt() + group["eps"]
-        table[seen] -= group["lr"] * first[seen] / (1 - beta1**times) / root
+        step = first[seen] / (1 - beta1**times) / root
+        if group.get("shrinkage"):
+            step = self._shrunk(table, step, count, seen, group)
+        table[seen] -= group["lr"] * step
+
+    def _shrunk(self, table: nn.Parameter, step: Tensor, count: Tensor, seen: Tensor, group: dict[str, Any]) -> Tensor:
+        """The steps of the rows seen, shrunk by what all rows' last visits say of signal and noise."""
+        entries = (1, *table.shape[1:-1], 1)
+        state = self.state[table]
+        ratio = state.setdefault("signal_to_noise", torch.ones(entries, device=table.device))
+        known = count[seen] >= KNOWN_VISITS
+        rows = float(known.sum())
+        if rows:
+            total = float((count - KNOWN_VISITS + 1).clamp_min(0).sum())
+            found = signal_to_noise(step[known], count[seen][known], group["betas"][0])
+            ratio += min(rows * max(1 / (total + 1), 1 / POOLED_VISITS), 1.0) * (found - ratio)
+        return shrink(step, ratio, group["shrinkage"])
 
     def _advanced(self, table: nn.Parameter) -> tuple[Tensor, Tensor, int]:
         """The means of a table's gradients and of their squares, zero at first, and the number of this step."""
@@ -90,7 +163,14 @@ def make_optimizer(
     Large tables are updated row by row where a process trains `alone`.
     """
     groups = [
-        {"params": g.parameters, "lr": g.rate, "name": g.name, "by_visit": g.by_visit, "decay_power": g.decay_power}
+        {
+            "params": g.parameters,
+            "lr": g.rate,
+            "name": g.name,
+            "by_visit": g.by_visit,
+            "decay_power": g.decay_power,
+            "shrinkage": g.shrinkage,
+        }
         for g in avatar.parameter_groups()
         if g.parameters
     ]

@@ -369,10 +369,13 @@ def load_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor])
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         if name.startswith("optimizer."):
-            match = re.fullmatch(r"optimizer\.(\d{1,6})\.(step|exp_avg|exp_avg_sq|visits)", name)
+            match = re.fullmatch(r"optimizer\.(\d{1,6})\.(step|exp_avg|exp_avg_sq|visits|signal_to_noise)", name)
             index = int(match[1]) if match else len(parameters)
             shape = parameters[index].shape if index < len(parameters) else torch.Size()
-            wanted = {"step": torch.Size(), "visits": shape[:1]}.get(match[2] if match else "", shape)
+            pooled = torch.Size((1, *shape[1:-1], 1))
+            wanted = {"step": torch.Size(), "visits": shape[:1], "signal_to_noise": pooled}.get(
+                match[2] if match else "", shape
+            )
             fits = index < len(parameters) and _kind(tensor) == (wanted, True)
             if match is None or not fits or not tensor.isfinite().all():
                 raise TwofoldError(f"The checkpoint does not fit the optimizer (first at {name}); train again.")
