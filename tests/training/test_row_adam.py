@@ -122,9 +122,15 @@ def test_quick_and_vid2avatar_ask_for_visits_of_poses_where_the_recipe_does(pers
     for name in ("quick", "vid2avatar"):
         for averages in ("steps", "visits"):
             method = CASES[name].method
-            avatar = replace(method, pose=replace(method.pose, averages=averages)).build(Subject.of(person), 0)
+            pose = replace(method.pose, averages=averages, shrinkage=0.0)
+            avatar = replace(method, pose=pose).build(Subject.of(person), 0)
             asked = {group.name for group in avatar.parameter_groups() if group.by_visit}
             assert asked == ({"pose"} if averages == "visits" else set())
+
+
+def test_shrinkage_without_averages_of_visits_is_refused():
+    with pytest.raises(ValueError, match="averages=visits; set shrinkage to 0 with other averages"):
+        replace(CASES["quick"].method.pose, averages="steps", shrinkage=1.0)
 
 
 def noise(generator, rows, mean):

@@ -64,7 +64,10 @@ class PoseConfig:
             decay_power=(0, 10),
             shrinkage=(0, 100),
         )
-        require(self.averages == "visits" or not self.shrinkage, "shrinkage needs averages=visits")
+        require(
+            self.averages == "visits" or not self.shrinkage,
+            "shrinkage needs averages=visits; set shrinkage to 0 with other averages",
+        )
 
     def group(self, name: str, rate: float, parameters: list[nn.Parameter]) -> ParameterGroup:
         """A group of a method's parameters; that of the corrections, named "pose", as is asked for here."""
