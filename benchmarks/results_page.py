@@ -20,7 +20,12 @@ RESULTS, PAGE, README = ROOT / "benchmarks" / "results", ROOT / "docs" / "result
 METHODS_PAGE = ROOT / "docs" / "methods" / "index.md"
 BEGIN, END = "<!-- results -->\n", "<!-- /results -->\n"
 """The lines of the README between which its table stands."""
-METHODS = {"studio": "On a synthetic subject", "p2s": "On a real video"}
+METHODS = {
+    "studio": "On a synthetic subject",
+    "p2s": "On a real video",
+    "juggle": "On a real video of a juggler",
+    "four": "On a real video, seen by other cameras",
+}
 """Stored comparisons of methods by name, with headings."""
 
 PICTURES = """## Images of real people

@@ -156,10 +156,26 @@ def _size(study: Mapping[str, Any], capital: bool = False) -> str:
     settings = f", {', '.join(f'`{s}`' for s in about['settings'])}" if about["settings"] else ""
     size = f" of {about['size']} x {about['size']}" if about.get("size") else ""
     text = (
-        f"{subjects} held-out synthetic subject{'s' * (subjects > 1)}{size}, {seeds} seed{'s' * (seeds > 1)} each, "
+        f"{subjects} held-out synthetic subject{'s' * (subjects > 1)}{size}, {seeds} seed{'s' * (seeds > 1)} each"
+        f"{_fewer_seeds(study)}, "
         f"recipe `{about['recipe']}`{f' with {steps[0]} steps' if len(steps) == 1 else ''}{settings}"
     )
     return text[0].upper() + text[1:] if capital else text
+
+
+def _fewer_seeds(study: Mapping[str, Any]) -> str:
+    """Which rows were trained with fewer seeds than the full model, in parentheses."""
+
+    def pairs(row: str) -> int:
+        return max((len(numbers) for numbers in study["rows"][row].values()), default=0)
+
+    most = max((pairs(row) for row in study["rows"] if row in FULL), default=0)
+    fewer: dict[int, list[str]] = {}
+    for row in study["rows"]:
+        if pairs(row) < most:
+            fewer.setdefault(pairs(row), []).append(row)
+    said = [f"{_listed(rows)} {count} of {most} trainings" for count, rows in sorted(fewer.items())]
+    return f" ({'; '.join(said)})" if said else ""
 
 
 def _listed(names: Sequence[str]) -> str:

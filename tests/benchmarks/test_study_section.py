@@ -63,6 +63,16 @@ def test_rows_of_different_length_say_how_long_they_trained():
     assert "recipe `quick`. Training of the full model: 350 steps, 0.5 min." in text
 
 
+def test_rows_with_fewer_seeds_than_the_full_model_are_named():
+    found = study(26.0, s1c1=-0.5, s2c2=-0.4, feat=0.25)
+    assert "4 seeds each, recipe" in section(found, _table)
+    for row, count in (("w/o {s1, c1}", 2), ("w/o feat", 2), ("w/o {s2, c2}", 3)):
+        numbers = found["rows"][row]
+        found["rows"][row] = {metric: dict(list(by.items())[:count]) for metric, by in numbers.items()}
+    expected = "4 seeds each (w/o {s1, c1} and w/o feat 2 of 4 trainings; w/o {s2, c2} 3 of 4 trainings), recipe"
+    assert expected in section(found, _table)
+
+
 def test_the_paper_is_named_only_where_it_has_a_number():
     found = study(26.0, feat=0.25)
     assert "the paper's difference on its subject 394" in section(found, _table)
