@@ -15,7 +15,7 @@ class ParameterGroup:
         parameters: may be empty.
         by_visit: whether Adam's means of a row change only in steps that have a gradient for it (see `RowAdam`).
         decay_power: power of what the schedule multiplies all rates with; 2 lets this one fall twice as fast.
-        shrinkage: how much steps by visits shrink where gradients are noise (see `twofold.training.row_adam`); 0: not.
+        shrinkage: factor of the noise by which steps by visits shrink (see `twofold.training.row_adam.shrink`).
     """
 
     name: str

@@ -38,8 +38,8 @@ class PoseConfig:
     """When Adam's running means of a frame's gradients change: "steps", in all, as in the release; "visits", in steps
     that see the frame, so that what its images say is averaged (ours; see `twofold.training.row_adam`)."""
     shrinkage: float = 0.0
-    """How often the noise of a joint's gradients is counted when its steps shrink by it; 0 for full steps (ours, with
-    averages of visits; see `twofold.training.row_adam.shrink`)."""
+    """Factor of the noise by which the steps of a joint's corrections shrink: larger values suppress more, 0 none
+    (ours, with averages of visits; see `twofold.training.row_adam.shrink`)."""
     decay_power: float = 1.0
     """Power of what the schedule multiplies the learning rate of the corrections with; 2 lets it fall twice as fast as
     the others (ours)."""
@@ -62,7 +62,7 @@ class PoseConfig:
             drop=(0, 1),
             refine_from=steps,
             decay_power=(0, 10),
-            shrinkage=(0, 100),
+            shrinkage=(0, 10),
         )
         require(
             self.averages == "visits" or not self.shrinkage,

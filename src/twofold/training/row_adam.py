@@ -12,59 +12,80 @@ from twofold.methods.base import Avatar
 from twofold.recipe import TrainingConfig
 from twofold.training.camera_colors import RATE, CameraColors
 
-KNOWN_VISITS = 3
-"""Visits after which a row's mean gradient is compared with its noise."""
-POOLED_VISITS = 64
-"""Visits of all rows over which that comparison is averaged."""
+POOLED_VISITS = 64.0
+"""Visits of all rows, weighted as in `signal_sums`, over which the share of signal is averaged."""
 
 
-def signal_to_noise(
-    step: Float[Tensor, "rows *entries numbers"], visits: Float[Tensor, "rows"], beta: float
-) -> Float[Tensor, "1 *entries 1"]:
-    r"""How much larger rows' mean gradients are than gradients of independent noise would have left them.
+def noise_share(visits: Float[Tensor, "rows"], beta: float) -> Float[Tensor, "rows"]:
+    r"""What is left of the variance of independent gradients in Adam's mean of them.
 
-    After $n$ visits Adam's mean $\hat m$ weights them by $w_i \propto \beta^{n - i}$, and of noise alone it has the
-    variance $s_n \hat v$, so
+    After $n$ visits the mean weights them by $w_i \propto \beta^{n - i}$, so
 
-    \[ \rho = \operatorname{mean}\Big(\frac{\hat m^2}{s_n \hat v}\Big), \qquad
-    s_n = \sum_i w_i^2 = \frac{1 - \beta}{1 + \beta} \, \frac{1 - \beta^{2n}}{(1 - \beta^n)^2} \]
+    \[ s_n = \sum_i w_i^2 = \frac{1 - \beta}{1 + \beta} \, \frac{1 - \beta^{2n}}{(1 - \beta^n)^2} \]
 
-    over the rows and the last axis is about 1 for noise, and larger where visits agree.
-
-    >>> signal_to_noise(torch.full((2, 3), 0.5), torch.tensor([1.0, 1.0]), 0.9)
-    tensor([[0.2500]])
+    >>> noise_share(torch.tensor([1.0, 1000.0]), 0.9)
+    tensor([1.0000, 0.0526])
 
     Args:
-        step: $\hat m / \sqrt{\hat v}$.
-        visits: of each row, at least one.
+        visits: $n$, at least one.
         beta: of the mean.
     """
-    n = visits.view(-1, *[1] * (step.dim() - 1))
-    noise = (1 - beta) / (1 + beta) * (1 - beta ** (2 * n)) / (1 - beta**n) ** 2
-    return (step.square() / noise).mean((0, -1), keepdim=True)
+    return (1 - beta) / (1 + beta) * (1 - beta ** (2 * visits)) / (1 - beta**visits) ** 2
+
+
+def signal_sums(
+    step: Float[Tensor, "rows *entries numbers"], visits: Float[Tensor, "rows"], beta: float
+) -> Float[Tensor, "2 *entries"]:
+    r"""How much of rows' gradients is the same in every visit, as a weighted sum, and the sum of weights.
+
+    Of gradients with a mean and independent noise the share $\kappa$ of the mean in the mean square follows from
+    $\hat m^2 / \hat v \approx \kappa + (1 - \kappa) s_n$, so
+
+    \[ \hat\kappa = \frac{\hat m^2 / \hat v - s_n}{1 - s_n}, \qquad w = \Big( \frac{s_\infty}{s_n} \Big)^2 \]
+
+    with $s_n$ of `noise_share`; weights are inverse variances under noise, relative to many visits. Numbers that never
+    had a gradient say nothing and have no weight.
+
+    >>> sums = signal_sums(torch.tensor([[0.0, 0.5, 0.5]]), torch.tensor([1000.0]), 0.9)
+    >>> [round(value, 3) for value in sums.tolist()]
+    [0.417, 2.0]
+
+    Args:
+        step: $\hat m / \sqrt{\hat v}$ of rows with two visits or more, 0 where there never was a gradient.
+        visits: of each row.
+        beta: of the mean.
+    """
+    noise = noise_share(visits, beta).view(-1, *[1] * (step.dim() - 1))
+    weight = (step != 0) * ((1 - beta) / (1 + beta) / noise) ** 2
+    share = (step.square() - noise) / (1 - noise)
+    return torch.stack([(weight * share).sum((0, -1)), weight.sum((0, -1))])
 
 
 def shrink(
-    step: Float[Tensor, "rows *entries numbers"], ratio: Float[Tensor, "1 *entries 1"], shrinkage: float
+    step: Float[Tensor, "rows *entries numbers"], share: Float[Tensor, "*entries"], shrinkage: float, beta: float
 ) -> Float[Tensor, "rows *entries numbers"]:
     r"""Steps shrunk as in Wiener's filter, with the noise counted $c$ times.
 
-    \[ \Delta' = \max\Big(0, 1 - \frac{c}{\rho}\Big) \, \Delta \]
+    \[ \Delta' = \max\Big(0, 1 - \frac{c}{\rho}\Big) \, \Delta, \qquad
+    \rho = \frac{\kappa + (1 - \kappa) s_\infty}{s_\infty} \]
 
-    Gradients of exact poses are noise of the images' rays, and steps of full length would make them worse; those of
-    poses that are off agree from visit to visit.
+    where $\rho$ is the mean square of Adam's mean after many visits, relative to that of noise alone: 1 without a
+    signal. Gradients of exact poses are noise of the images' rays, and steps of full length would make them worse;
+    those of poses that are off agree from visit to visit.
 
-    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor([[3.0]]), 1.5)
+    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor(1 / 9), 1.5, 0.9)
     tensor([[ 0.5000, -0.5000]])
-    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor([[1.2]]), 1.5)
+    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor(0.01), 1.5, 0.9)
     tensor([[0., -0.]])
 
     Args:
         step: $\Delta$.
-        ratio: $\rho$ of `signal_to_noise`.
+        share: $\kappa$ by `signal_sums`; negative where it was estimated so.
         shrinkage: $c$.
+        beta: of the mean.
     """
-    return step * (1 - shrinkage / ratio.clamp_min(1e-6)).clamp_min(0)
+    ratio = 1 + share * ((1 + beta) / (1 - beta) - 1)
+    return step * (1 - shrinkage / ratio.clamp_min(1e-6)).clamp_min(0)[..., None]
 
 
 class RowAdam(torch.optim.Adam):
@@ -92,7 +113,7 @@ class RowAdam(torch.optim.Adam):
             for parameter in group["params"]:
                 if parameter in self.rows:
                     self._step_rows(parameter, group)
-                elif group.get("by_visit") and parameter.dim() > 1 and parameter.grad is not None:
+                elif _by_visit(parameter, group) and parameter.grad is not None:
                     self._step_visited(parameter, group)
         return super().step(closure)
 
@@ -113,7 +134,7 @@ class RowAdam(torch.optim.Adam):
             return
         first, second, _ = self._advanced(table)
         count = self.state[table].setdefault("visits", torch.zeros(len(table), device=table.device))
-        seen = gradient.flatten(1).abs().amax(1).nonzero()[:, 0]
+        seen = gradient.reshape(len(gradient), -1).abs().amax(1).nonzero()[:, 0]
         g, table.grad = gradient[seen], None
         count[seen] += 1
         times = count[seen].view(-1, *[1] * (table.dim() - 1))
@@ -126,17 +147,15 @@ class RowAdam(torch.optim.Adam):
         table[seen] -= group["lr"] * step
 
     def _shrunk(self, table: nn.Parameter, step: Tensor, count: Tensor, seen: Tensor, group: dict[str, Any]) -> Tensor:
-        """The steps of the rows seen, shrunk by what all rows' last visits say of signal and noise."""
-        entries = (1, *table.shape[1:-1], 1)
-        state = self.state[table]
-        ratio = state.setdefault("signal_to_noise", torch.ones(entries, device=table.device))
-        known = count[seen] >= KNOWN_VISITS
-        rows = float(known.sum())
-        if rows:
-            total = float((count - KNOWN_VISITS + 1).clamp_min(0).sum())
-            found = signal_to_noise(step[known], count[seen][known], group["betas"][0])
-            ratio += min(rows * max(1 / (total + 1), 1 / POOLED_VISITS), 1.0) * (found - ratio)
-        return shrink(step, ratio, group["shrinkage"])
+        """The steps of the rows seen, shrunk by the share of signal in recent visits of all rows."""
+        beta, state = group["betas"][0], self.state[table]
+        sums = state.setdefault("signal_sums", torch.zeros(2, *table.shape[1:-1], device=table.device))
+        rows = step if step.dim() > 1 else step[:, None]
+        known = count[seen] >= 2
+        if known.any():
+            new = signal_sums(rows[known], count[seen][known], beta)
+            sums.mul_(1 - (new[1] / rows.shape[-1] / POOLED_VISITS).clamp_max(1)).add_(new / rows.shape[-1])
+        return shrink(rows, sums[0] / (sums[1] + 1), group["shrinkage"], beta).view_as(step)
 
     def _advanced(self, table: nn.Parameter) -> tuple[Tensor, Tensor, int]:
         """The means of a table's gradients and of their squares, zero at first, and the number of this step."""
@@ -153,6 +172,11 @@ class RowAdam(torch.optim.Adam):
         for table, gradient in self.rows.items():
             if self.state[table]:
                 gradient.know(self.state[table]["exp_avg_sq"])
+
+
+def _by_visit(parameter: nn.Parameter, group: dict[str, Any]) -> bool:
+    """Whether rows have visits of their own. A list of numbers that all steps see needs them for shrinkage only."""
+    return bool(group.get("by_visit") and (parameter.dim() > 1 or group.get("shrinkage")))
 
 
 def make_optimizer(

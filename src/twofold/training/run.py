@@ -369,7 +369,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor])
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         if name.startswith("optimizer."):
-            match = re.fullmatch(r"optimizer\.(\d{1,6})\.(step|exp_avg|exp_avg_sq|visits|signal_to_noise)", name)
+            match = re.fullmatch(r"optimizer\.(\d{1,6})\.(step|exp_avg|exp_avg_sq|visits|signal_sums)", name)
             index = int(match[1]) if match else len(parameters)
             shape = parameters[index].shape if index < len(parameters) else torch.Size()
             pooled = torch.Size((1, *shape[1:-1], 1))
