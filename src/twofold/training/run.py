@@ -372,8 +372,8 @@ def load_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor])
             match = re.fullmatch(r"optimizer\.(\d{1,6})\.(step|exp_avg|exp_avg_sq|visits|signal_sums)", name)
             index = int(match[1]) if match else len(parameters)
             shape = parameters[index].shape if index < len(parameters) else torch.Size()
-            pooled = torch.Size((1, *shape[1:-1], 1))
-            wanted = {"step": torch.Size(), "visits": shape[:1], "signal_to_noise": pooled}.get(
+            pooled = torch.Size((2, *shape[1:-1]))
+            wanted = {"step": torch.Size(), "visits": shape[:1], "signal_sums": pooled}.get(
                 match[2] if match else "", shape
             )
             fits = index < len(parameters) and _kind(tensor) == (wanted, True)
