@@ -30,9 +30,22 @@ def test_a_clone_is_known_by_its_commit_and_changed_sources_by_a_plus(clone):
     head = git("rev-parse", "--short=7", "HEAD")
     assert provenance.commit(package) == head
     (package.parents[1] / "notes.txt").write_text("beside the sources")
+    provenance.commit.cache_clear()
     assert provenance.commit(package) == head
     (package / "new.py").write_text("")
+    # What this process imported does not change any more.
+    assert provenance.commit(package) == head
+    provenance.commit.cache_clear()
     assert provenance.commit(package) == head + "+"
+
+
+def test_where_git_cannot_compare_the_sources_the_commit_is_kept_with_a_question_mark(clone, monkeypatch):
+    package, git = clone
+    git("add", "-A")
+    git("commit", "-m", "x")
+    told = provenance._told
+    monkeypatch.setattr(provenance, "_told", lambda at, *words: None if words[0] == "status" else told(at, *words))
+    assert provenance.commit(package) == git("rev-parse", "--short=7", "HEAD") + "?"
 
 
 def test_a_package_installed_inside_of_another_repository_has_no_commit(clone):

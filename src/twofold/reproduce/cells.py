@@ -30,7 +30,7 @@ from twofold.reproduce.sources import FolderSource, Source, StudioSource
 from twofold.training import loop
 from twofold.training.lock import locked
 from twofold.training.perceptual_loss import attach_perceptual
-from twofold.training.run import RECIPE, choose_device
+from twofold.training.run import RECIPE, choose_device, read_about
 
 CELLS, CAPTURES = "cells", "captures"
 """Folders of an experiment."""
@@ -205,7 +205,8 @@ def train_and_measure(folder: Path) -> None:
     )
     known = read_json(folder / RATE) if (folder / RATE).is_file() else {}
     seconds = (known if isinstance(known, dict) else {}) | {"measuring": time.monotonic() - measuring}
-    about = {"recipe": cell.recipe.name, "seed": cell.recipe.seed, "subject": cell.source.name, "made_with": program()}
+    about = {"recipe": cell.recipe.name, "seed": cell.recipe.seed, "subject": cell.source.name}
+    about["made_with"] = program(read_about(run))
     write_json(folder / RESULTS, about | {"seconds": seconds, "measures": asdict(cell.measures)} | found)
     note(1.0, "done", force=True)
 

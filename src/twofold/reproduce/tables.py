@@ -237,21 +237,22 @@ def as_json(table: FilledTable) -> dict[str, Any]:
 
 
 def _programs(cells: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A note where cells were made with different versions of the program: they are kept by their settings alone.
+    """A note where trainings of the cells began with different versions of the program.
 
     >>> _programs([{"state": "done", "made_with": "0.1.0"}] * 2)
     []
     >>> (note,) = _programs([{"state": "done", "made_with": "0.1.0"}, {"state": "done", "made_with": "0.2.0"}])
-    >>> note.partition(";")[0]
-    'Cells were made with different versions of twofold: 0.1.0 (1), 0.2.0 (1)'
+    >>> note.partition("; ")[0]
+    'Cells were trained with different versions of twofold: 0.1.0 (1), 0.2.0 (1)'
     """
-    counts = Counter(cell["made_with"] or "an unknown one" for cell in cells if cell["state"] == "done")
+    names = [cell["made_with"] for cell in cells if cell["state"] == "done"]
+    counts = Counter(name if isinstance(name, str) else "an unknown one" for name in names)
     if len(counts) < 2:
         return []
     told = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
     return [
-        f"Cells were made with different versions of twofold: {told}; remove folders of cells (cells/KEY, by the keys "
-        "in the table's JSON) to make these anew."
+        f"Cells were trained with different versions of twofold: {told}; to train one again, delete its folder "
+        "cells/KEY (keys are in the table's JSON)."
     ]
 
 
