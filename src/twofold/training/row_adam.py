@@ -62,30 +62,35 @@ def signal_sums(
 
 
 def shrink(
-    step: Float[Tensor, "rows *entries numbers"], share: Float[Tensor, "*entries"], shrinkage: float, beta: float
-) -> Float[Tensor, "rows *entries numbers"]:
+    step: Float[Tensor, "rows *entries numbers"], share: Float[Tensor, "*entries"], visits: Float[Tensor, "rows"],
+    shrinkage: float, beta: float,
+) -> Float[Tensor, "rows *entries numbers"]:  # fmt: skip
     r"""Steps shrunk as in Wiener's filter, with the noise counted $c$ times.
 
     \[ \Delta' = \max\Big(0, 1 - \frac{c}{\rho}\Big) \, \Delta, \qquad
-    \rho = \frac{\kappa + (1 - \kappa) s_\infty}{s_\infty} \]
+    \rho = \frac{\kappa + (1 - \kappa) s_n}{s_n} \]
 
-    where $\rho$ is the mean square of Adam's mean after many visits, relative to that of noise alone: 1 without a
-    signal. Gradients of exact poses are noise of the images' rays, and steps of full length would make them worse;
-    those of poses that are off agree from visit to visit.
+    where $\rho$ is the mean square of Adam's mean after $n$ visits, relative to that of noise alone: 1 without a
+    signal, and at most $1 / s_n$. Gradients of exact poses are noise of the images' rays, and steps of full length
+    would make them worse; those of poses that are off agree from visit to visit. After one visit nothing is known, and
+    nothing moves if $c \ge 1$.
 
-    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor(1 / 9), 1.5, 0.9)
+    >>> many = torch.tensor([1000.0])
+    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor(1 / 9), many, 1.5, 0.9)
     tensor([[ 0.5000, -0.5000]])
-    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor(0.01), 1.5, 0.9)
+    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor(0.01), many, 1.5, 0.9)
     tensor([[0., -0.]])
 
     Args:
         step: $\Delta$.
         share: $\kappa$ by `signal_sums`; negative where it was estimated so.
+        visits: $n$ of each row.
         shrinkage: $c$.
         beta: of the mean.
     """
-    ratio = 1 + share * ((1 + beta) / (1 - beta) - 1)
-    return step * (1 - shrinkage / ratio.clamp_min(1e-6)).clamp_min(0)[..., None]
+    noise = noise_share(visits, beta).view(-1, *[1] * (step.dim() - 1))
+    ratio = 1 + share[..., None] * (1 / noise - 1)
+    return step * (1 - shrinkage / ratio.clamp_min(1e-6)).clamp_min(0)
 
 
 class RowAdam(torch.optim.Adam):
@@ -155,7 +160,7 @@ class RowAdam(torch.optim.Adam):
         if known.any():
             new = signal_sums(rows[known], count[seen][known], beta)
             sums.mul_(1 - (new[1] / rows.shape[-1] / POOLED_VISITS).clamp_max(1)).add_(new / rows.shape[-1])
-        return shrink(rows, sums[0] / (sums[1] + 1), group["shrinkage"], beta).view_as(step)
+        return shrink(rows, sums[0] / (sums[1] + 1), count[seen], group["shrinkage"], beta).view_as(step)
 
     def _advanced(self, table: nn.Parameter) -> tuple[Tensor, Tensor, int]:
         """The means of a table's gradients and of their squares, zero at first, and the number of this step."""
