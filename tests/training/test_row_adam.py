@@ -185,6 +185,17 @@ def test_frames_seen_three_times_still_move_where_visits_agree():
     assert moved[0.0] < 0.05
 
 
+def test_a_body_without_shapes_has_nothing_to_shrink():
+    """As captures whose body was fitted elsewhere have it."""
+    empty, table = torch.nn.Parameter(torch.zeros(0)), torch.nn.Parameter(torch.zeros(4, 23, 3))
+    group = {"params": [empty, table], "lr": 0.001, "name": "pose", "by_visit": True, "shrinkage": 1.5}
+    optimizer = RowAdam([group], {}, (0.9, 0.99), 1e-15)
+    for _ in range(4):
+        empty.grad, table.grad = torch.zeros(0), torch.ones(4, 23, 3)
+        optimizer.step()
+    assert table.detach().any()
+
+
 def test_shape_numbers_shrink_together():
     generator = torch.Generator().manual_seed(7)
     moved = {}

@@ -180,8 +180,11 @@ class RowAdam(torch.optim.Adam):
 
 
 def _by_visit(parameter: nn.Parameter, group: dict[str, Any]) -> bool:
-    """Whether rows have visits of their own. A list of numbers that all steps see needs them for shrinkage only."""
-    return bool(group.get("by_visit") and (parameter.dim() > 1 or group.get("shrinkage")))
+    """Whether rows have visits of their own. A list of numbers that all steps see needs them for shrinkage only.
+
+    A body model without shapes has an empty list of them.
+    """
+    return bool(group.get("by_visit") and len(parameter) and (parameter.dim() > 1 or group.get("shrinkage")))
 
 
 def make_optimizer(
