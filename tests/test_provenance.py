@@ -71,4 +71,4 @@ def test_versions_and_the_commit_are_told(head, monkeypatch):
     assert told["twofold"] == __version__
     assert told["packages"]["torch"].startswith("2.")
     assert told.get("commit") == head
-    assert provenance.program() == (f"{__version__} at f22924d" if head else __version__)
+    assert provenance.program(told) == (f"{__version__} at f22924d" if head else __version__)

@@ -43,16 +43,15 @@ def _told(package: Path, *words: str) -> str | None:
     return call.stdout.decode(errors="replace").strip()
 
 
-def program(made: dict[str, object] | None = None) -> str:
-    """Version of twofold and, in a clone, the commit.
+def program(made: dict[str, object]) -> str:
+    """Version of twofold and, of a clone, the commit.
 
     >>> program({"twofold": "0.1.0", "commit": "f22924d"})
     '0.1.0 at f22924d'
 
     Args:
-        made: what `made_with` told elsewhere; by default what runs now.
+        made: what `made_with` told.
     """
-    made = {"twofold": __version__, "commit": commit()} if made is None else made
     return f"{made.get('twofold')} at {made['commit']}" if made.get("commit") else str(made.get("twofold"))
 
 

@@ -34,7 +34,7 @@ def noise_share(visits: Float[Tensor, "rows"], beta: float) -> Float[Tensor, "ro
 
 
 def signal_sums(
-    step: Float[Tensor, "rows *entries numbers"], visits: Float[Tensor, "rows"], beta: float
+    step: Float[Tensor, "rows *entries numbers"], noise: Float[Tensor, "rows"], beta: float
 ) -> Float[Tensor, "2 *entries"]:
     r"""How much of rows' gradients is the same in every visit, as a weighted sum, and the sum of weights.
 
@@ -43,27 +43,27 @@ def signal_sums(
 
     \[ \hat\kappa = \frac{\hat m^2 / \hat v - s_n}{1 - s_n}, \qquad w = \Big( \frac{s_\infty}{s_n} \Big)^2 \]
 
-    with $s_n$ of `noise_share`; weights are inverse variances under noise, relative to many visits. Numbers that never
-    had a gradient say nothing and have no weight.
+    Weights are inverse variances under noise, relative to many visits. Numbers that never had a gradient say nothing
+    and have no weight.
 
-    >>> sums = signal_sums(torch.tensor([[0.0, 0.5, 0.5]]), torch.tensor([1000.0]), 0.9)
+    >>> sums = signal_sums(torch.tensor([[0.0, 0.5, 0.5]]), torch.tensor([1 / 19]), 0.9)
     >>> [round(value, 3) for value in sums.tolist()]
     [0.417, 2.0]
 
     Args:
         step: $\hat m / \sqrt{\hat v}$ of rows with two visits or more, 0 where there never was a gradient.
-        visits: of each row.
+        noise: $s_n$ of each row by `noise_share`.
         beta: of the mean.
     """
-    noise = noise_share(visits, beta).view(-1, *[1] * (step.dim() - 1))
-    weight = (step != 0) * ((1 - beta) / (1 + beta) / noise) ** 2
-    share = (step.square() - noise) / (1 - noise)
+    s = noise.view(-1, *[1] * (step.dim() - 1))
+    weight = (step != 0) * ((1 - beta) / (1 + beta) / s) ** 2
+    share = (step.square() - s) / (1 - s)
     return torch.stack([(weight * share).sum((0, -1)), weight.sum((0, -1))])
 
 
 def shrink(
-    step: Float[Tensor, "rows *entries numbers"], share: Float[Tensor, "*entries"], visits: Float[Tensor, "rows"],
-    shrinkage: float, beta: float,
+    step: Float[Tensor, "rows *entries numbers"], share: Float[Tensor, "*entries"], noise: Float[Tensor, "rows"],
+    shrinkage: float,
 ) -> Float[Tensor, "rows *entries numbers"]:  # fmt: skip
     r"""Steps shrunk as in Wiener's filter, with the noise counted $c$ times.
 
@@ -75,21 +75,19 @@ def shrink(
     would make them worse; those of poses that are off agree from visit to visit. After one visit nothing is known, and
     nothing moves if $c \ge 1$.
 
-    >>> many = torch.tensor([1000.0])
-    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor(1 / 9), many, 1.5, 0.9)
+    >>> noise = torch.tensor([1 / 19])
+    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor(1 / 9), noise, 1.5)
     tensor([[ 0.5000, -0.5000]])
-    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor(0.01), many, 1.5, 0.9)
+    >>> shrink(torch.tensor([[1.0, -1.0]]), torch.tensor(0.01), noise, 1.5)
     tensor([[0., -0.]])
 
     Args:
         step: $\Delta$.
         share: $\kappa$ by `signal_sums`; negative where it was estimated so.
-        visits: $n$ of each row.
+        noise: $s_n$ of each row by `noise_share`.
         shrinkage: $c$.
-        beta: of the mean.
     """
-    noise = noise_share(visits, beta).view(-1, *[1] * (step.dim() - 1))
-    ratio = 1 + share[..., None] * (1 / noise - 1)
+    ratio = 1 + share[..., None] * (1 / noise.view(-1, *[1] * (step.dim() - 1)) - 1)
     return step * (1 - shrinkage / ratio.clamp_min(1e-6)).clamp_min(0)
 
 
@@ -156,11 +154,11 @@ class RowAdam(torch.optim.Adam):
         beta, state = group["betas"][0], self.state[table]
         sums = state.setdefault("signal_sums", torch.zeros(2, *table.shape[1:-1], device=table.device))
         rows = step if step.dim() > 1 else step[:, None]
-        known = count[seen] >= 2
+        known, noise = count[seen] >= 2, noise_share(count[seen], beta)
         if known.any():
-            new = signal_sums(rows[known], count[seen][known], beta)
-            sums.mul_(1 - (new[1] / rows.shape[-1] / POOLED_VISITS).clamp_max(1)).add_(new / rows.shape[-1])
-        return shrink(rows, sums[0] / (sums[1] + 1), count[seen], group["shrinkage"], beta).view_as(step)
+            new = signal_sums(rows[known], noise[known], beta) / rows.shape[-1]
+            sums.mul_(1 - (new[1] / POOLED_VISITS).clamp_max(1)).add_(new)
+        return shrink(rows, sums[0] / (sums[1] + 1), noise, group["shrinkage"]).view_as(step)
 
     def _advanced(self, table: nn.Parameter) -> tuple[Tensor, Tensor, int]:
         """The means of a table's gradients and of their squares, zero at first, and the number of this step."""
