@@ -8,7 +8,7 @@ from small_recipes import CASES
 
 from twofold.methods.subject import Subject
 from twofold.training import loop
-from twofold.training.row_adam import RowAdam, noise_share
+from twofold.training.row_adam import RowAdam, few_visits, noise_share
 
 
 def trained(person, recipe, folder, steps, monkeypatch, rows=True, resume=False):
@@ -242,3 +242,29 @@ def test_resumed_shrinkage_repeats_the_steps(person, recipe, tmp_path, monkeypat
     parts = trained(person, recipe, tmp_path / "parts", 12, monkeypatch, resume=True)
     assert whole["refinement.body"].any()
     assert torch.equal(whole["refinement.body"], parts["refinement.body"])
+
+
+def test_a_training_that_sees_poses_seldom_says_so(person, recipe, tmp_path):
+    """`person` has frames of one camera; steps see one image."""
+    times = len({frame.frame_index for frame in person.train})
+    pose = replace(recipe.method.pose, averages="visits", shrinkage=1.5)
+    method = replace(recipe.method, pose=pose)
+    avatar = method.build(Subject.of(person), 0)
+
+    def said(steps, avatar=avatar, images=1):
+        training = replace(recipe.training, steps=steps, images_per_step=images)
+        return few_visits(avatar.parameter_groups(), training, person.train)
+
+    assert said(6 * times) is None
+    assert said(2 * times, images=3) is None
+    note = said(2 * times)
+    assert f"seen 2 times in {2 * times} steps" in note
+    assert f"--steps {10 * times} " in note
+    assert f"--steps {5 * times} " in said(times, images=2)
+    fixed = replace(method, pose=replace(pose, refine=())).build(Subject.of(person), 0)
+    assert said(times, fixed) is None
+    assert said(times, replace(method, pose=replace(pose, shrinkage=0.0)).build(Subject.of(person), 0)) is None
+    spoken = []
+    short = replace(recipe, method=method, training=replace(recipe.training, steps=2))
+    loop.train(person, short, tmp_path / "run", torch.device("cpu"), say=spoken.append)
+    assert few_visits(avatar.parameter_groups(), short.training, person.train) in spoken

@@ -30,7 +30,7 @@ from twofold.training.curves import Curves
 from twofold.training.lock import locked
 from twofold.training.pixels import PixelSource
 from twofold.training.processes import Team, joined
-from twofold.training.row_adam import make_optimizer
+from twofold.training.row_adam import few_visits, make_optimizer
 from twofold.training.run import (
     CHECKPOINT,
     load_optimizer,
@@ -199,8 +199,9 @@ def train(
             require_free(folder)
         avatar = recipe.method.build(subject, recipe.seed).to(device)
         found = None if resume else avatar.check_capture(capture)
+        seldom = few_visits(avatar.parameter_groups(), avatar.stages(config)[-1].training, capture.train)
         first = before_first(avatar) if before_first else None
-        notes = [note for note in (first, found, settled) if note]
+        notes = [note for note in (first, found, settled, seldom) if note]
         if wants_compiling(config, device):
             notes.append(COMPILED if at_the_end.enter_context(avatar.compiled()) else NOTHING_COMPILED)
         if say and team.leads:

@@ -1,19 +1,24 @@
 """Adam whose large tables are updated row by row, and whose rows may each have means of their own."""
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from twofold.capture.types import Frame
 from twofold.kernels.row_gradient import RowGradient, adam_rows
 from twofold.methods.base import Avatar
+from twofold.methods.parameter_group import ParameterGroup
 from twofold.recipe import TrainingConfig
 from twofold.training.camera_colors import RATE, CameraColors
 
 POOLED_VISITS = 64.0
 """Visits of all rows, weighted as in `signal_sums`, over which the share of signal is averaged."""
+FEW_VISITS, ENOUGH_VISITS = 6, 10
+"""Visits of a frame by which steps that shrink have at most two thirds, and five sixths, of their length (`shrink`)."""
 
 
 def noise_share(visits: Float[Tensor, "rows"], beta: float) -> Float[Tensor, "rows"]:
@@ -89,6 +94,27 @@ def shrink(
     """
     ratio = 1 + share[..., None] * (1 / noise.view(-1, *[1] * (step.dim() - 1)) - 1)
     return step * (1 - shrinkage / ratio.clamp_min(1e-6)).clamp_min(0)
+
+
+def few_visits(
+    groups: Iterable[ParameterGroup], training: TrainingConfig, frames: Sequence[Frame]
+) -> str | None:  # fmt: skip
+    """What to tell the user where corrections of poses shrink and frames are visited too seldom for that; else None.
+
+    Args:
+        groups: of the avatar.
+        training: steps and images a step.
+        frames: to be trained on; those of one time, from several cameras, share a correction.
+    """
+    times = len({frame.frame_index for frame in frames})
+    visits = training.steps * training.images_per_step / times
+    if visits >= FEW_VISITS or not any(group.shrinkage and group.parameters for group in groups):
+        return None
+    enough = math.ceil(ENOUGH_VISITS * times / training.images_per_step)
+    return (
+        f"Each pose is seen {visits:.2g} times in {training.steps:,} steps, and correcting it takes about "
+        f"{ENOUGH_VISITS}: poses will stay almost as the capture gives them. --steps {enough} corrects them."
+    )
 
 
 class RowAdam(torch.optim.Adam):
