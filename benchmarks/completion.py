@@ -24,7 +24,7 @@ from twofold.evaluation import render_frame
 from twofold.kernels.runtime import tune_process
 from twofold.methods.base import Avatar
 from twofold.methods.factorized_recipes import quick
-from twofold.methods.table import with_completion
+from twofold.methods.table import fitted, with_completion
 from twofold.metrics.image import psnr
 from twofold.outputs.coverage_error import PROTOCOL, CoverageErrors
 from twofold.recipe import Recipe
@@ -50,7 +50,7 @@ def recipe(steps: int, on: bool) -> Recipe:
 
 def trained(capture: Capture, folder: Path, steps: int, on: bool) -> Avatar:
     """The avatar of a finished run in `folder`, or of a new one."""
-    chosen = recipe(steps, on)
+    chosen = fitted(recipe(steps, on), capture)[0]
     if not (folder / CHECKPOINT).is_file() or load(folder)[1] < steps or read_recipe(folder) != chosen:
         train(capture, chosen, folder, torch.device("cpu"))
     return load(folder)[0]

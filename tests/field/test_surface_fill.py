@@ -94,6 +94,18 @@ def test_stripes_go_on_behind():
     assert np.abs(found - stripes)[back].mean() < 0.12  # 0.5 without stripes
 
 
+def test_a_faint_shadow_at_the_sides_does_not_become_a_stripe():
+    """Arms that hang down darken a few centimetres of both sides."""
+    surface = SurfaceFill(SHAPED, FRONT.astype(np.float32), areas(), NORMALS[:, 2], 20_000)
+    height, facing = surface.samples.at(REST)[:, 1], surface.samples.at(NORMALS)[:, 2]
+    shadow = (np.abs(height - 0.1) < 0.025) & (facing < 0.6)
+    values = np.where(shadow, 0.44, 0.5)[:, None]
+    back = (facing < -0.5) & (surface.weight == 0) & (surface.group == TRUNK) & (np.abs(height - 0.1) < 0.02)
+    assert back.sum() > 50
+    assert np.abs(surface(values) - 0.5)[back].mean() < 0.01
+    assert np.abs(surface(values, faint=None) - 0.5)[back].mean() > 0.03
+
+
 def test_an_open_collar_does_not_go_around_the_neck():
     neck = float(SHAPED.joints[12, 1])
     surface = SurfaceFill(SHAPED, FRONT.astype(np.float32), areas(), NORMALS[:, 2], 20_000)

@@ -3,7 +3,13 @@
 import numpy as np
 import torch
 
-from twofold.field.surface_samples import even_samples, ring_medians, slope_within, weighted_median
+from twofold.field.surface_samples import (
+    even_samples,
+    ring_medians,
+    slope_within,
+    weighted_median,
+    without_faint_bands,
+)
 
 SQUARE = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -52,6 +58,21 @@ def test_a_part_that_nobody_saw_takes_the_median_of_all():
     _, group, along = rings()
     found = ring_medians(np.where(group, 7.0, along)[:, None], (group == 0) * 1.0, group, along, 0.02, 1.0)
     assert abs(found[group == 1, 0].mean() - 0.5) < 0.03
+
+
+def test_faint_bands_disappear_and_steps_stay_where_they_are(generator):
+    places = np.arange(120) * 0.006
+    hem = np.where(places > 0.4, 0.3, 0.0)[:, None] * [1.0, 0.5, 0.2]
+    band = np.where(np.abs(places - 0.2) < 0.025, 0.05, 0.0)[:, None]
+    noise = 0.005 * torch.randn(120, 3, generator=generator).numpy()
+    found = without_faint_bands(hem + band + noise, places, 0.04)
+    assert np.abs(found - hem).max() < 0.015
+    assert np.abs(without_faint_bands(hem + 5 * band, places, 0.04) - hem - 5 * band).max() < 0.01
+
+
+def test_one_ring_and_equal_rings_stay():
+    assert without_faint_bands(np.array([[0.3, 0.2]]), np.zeros(1), 0.04).tolist() == [[0.3, 0.2]]
+    assert np.allclose(without_faint_bands(np.full((9, 2), 0.7), np.arange(9.0), 0.04), 0.7)
 
 
 def test_slopes_are_found_within_rings_and_an_emblem_does_not_change_them():

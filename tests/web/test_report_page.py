@@ -83,6 +83,8 @@ def click(tab: Tab, role: str) -> None:
 def test_character_moves_and_can_be_posed_with_the_network_off(page: Path, tmp_path: Path) -> None:
     with browser_tab(tmp_path / "profile") as tab:
         opened(tab, page)
+        # The first frames compile shaders, which takes seconds on a busy machine without a GPU.
+        tab.wait_for("twofoldCharacter.stage.renderer.info.render.frame > 3")
         first, joints = save(tab, "page-playing-1.png"), np.array(tab.run(JOINTS))
         start = time.monotonic()
         frames = tab.run("twofoldCharacter.stage.renderer.info.render.frame")

@@ -24,6 +24,8 @@ SAMPLES = 40_000
 """Points on the surface, some 7 mm apart: fine enough for stripes, which the vertices of a body are not."""
 RING = 0.006
 """Height of a ring around a body part, metres."""
+FAINT = 0.04
+"""By how much colours may differ from ring to ring, 0..1, and still become alike: stripes and hems differ by more."""
 ENOUGH = 2e-5
 """Observed area without which a ring takes its value from those beside, square metres."""
 OBSERVED_LENGTH, MIRROR_LENGTH, HAIR_LENGTH, RING_LENGTH = 0.012, 0.02, 0.025, 0.04
@@ -148,7 +150,9 @@ class SurfaceFill:
         diagonal = self._observed + mass * (unseen * (ring + mirrored) + 1 / FREE_LENGTH**2)
         self._solver: SuperLU = splu((laplacian + sparse.diags(diagonal)).tocsc())
 
-    def __call__(self, values: Float[np.ndarray, "n C"], ring: float = RING) -> Float[np.ndarray, "n C"]:
+    def __call__(
+        self, values: Float[np.ndarray, "n C"], ring: float = RING, faint: float | None = FAINT
+    ) -> Float[np.ndarray, "n C"]:
         r"""The completed values at the samples: by their weight the observed ones, for the rest what was completed.
 
         That is $g + u$ with the guess $g$ from rings and hair and the $u$ that minimises
@@ -161,16 +165,20 @@ class SurfaceFill:
         Args:
             values: as observed, at the samples; where the weight is 0 they do not matter.
             ring: height of a ring, metres.
+            faint: bands of rings that differ by less from those beside are left out: shadows of arms, and folds; None
+                for none.
         """
         values = np.where(self.weight[:, None] > 0, values, 0).astype(np.float64)
-        guess = self.guess(values, ring)
+        guess = self.guess(values, ring, faint)
         rest = (self._gather @ (values - guess)) / self._gathered.clip(1e-12)[:, None]
         completed = guess + self.samples.at(self._solver.solve(self._observed[:, None] * rest))
         return (completed + self.weight[:, None] * (values - completed)).astype(np.float32)
 
-    def guess(self, values: Float[np.ndarray, "n C"], ring: float = RING) -> Float[np.ndarray, "n C"]:
+    def guess(
+        self, values: Float[np.ndarray, "n C"], ring: float = RING, faint: float | None = FAINT
+    ) -> Float[np.ndarray, "n C"]:
         """Each sample's mirror image by how well it was seen; for the rest its ring (`ring_medians`), or the hair."""
-        around = ring_medians(values, self._beside, self.group, self.along, ring, ENOUGH, self._ring_at)
+        around = ring_medians(values, self._beside, self.group, self.along, ring, ENOUGH, self._ring_at, faint)
         alone = around + self.hairy[:, None] * (self._hair(values) - around)
         return alone + self._seen_there[:, None] * (values[self._mirrored] - alone)
 

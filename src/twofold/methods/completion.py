@@ -204,7 +204,7 @@ class Completion(nn.Module):
         brightness = np.exp(slope * np.where(facing < 0, TURNED_AWAY * facing, facing))[:, None]
         found = torch.from_numpy(on.fill(lit / brightness) * brightness).to(self.target)
         self.target.copy_((found / light).clamp(0, 1))
-        away = torch.from_numpy(on.shape_fill(offset[:, None].cpu().numpy(), SHAPE_RING))[:, 0]
+        away = torch.from_numpy(on.shape_fill(offset[:, None].cpu().numpy(), SHAPE_RING, None))[:, 0]
         self.offset.copy_(away.clamp(LOWEST, HIGHEST))
 
     @property
