@@ -106,6 +106,18 @@ def test_a_faint_shadow_at_the_sides_does_not_become_a_stripe():
     assert np.abs(surface(values, faint=None) - 0.5)[back].mean() > 0.03
 
 
+def test_cloth_between_the_legs_in_front_does_not_thicken_the_buttocks():
+    """At that height only the front of the trunk was seen, and thighs beside it."""
+    surface = SurfaceFill(SHAPED, FRONT.astype(np.float32), areas(), NORMALS[:, 2], 20_000)
+    height, facing = surface.samples.at(REST)[:, 1], surface.samples.at(NORMALS)[:, 2]
+    lowest = height[(surface.group == TRUNK) & (surface.weight > 0)].min()
+    trunk = (surface.group == TRUNK) & (height < lowest + 0.1)
+    found = surface(np.where(trunk, 0.05, 0.0)[:, None], 0.02, None)[:, 0]
+    behind = (facing < -0.5) & (surface.weight == 0) & trunk & (height < lowest + 0.06)
+    assert behind.sum() > 50
+    assert np.median(found[behind]) < 0.01
+
+
 def test_an_open_collar_does_not_go_around_the_neck():
     neck = float(SHAPED.joints[12, 1])
     surface = SurfaceFill(SHAPED, FRONT.astype(np.float32), areas(), NORMALS[:, 2], 20_000)
