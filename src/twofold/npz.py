@@ -150,3 +150,12 @@ def _header(
     if len(shape) > 32 or max(shape, default=0) > 2**31 or begin + count * item != info.file_size:
         raise _Damaged
     return np.dtype(kind[1]), shape, order[1] == "True", begin, count * item
+
+
+def not_increasing(numbers: np.ndarray) -> list[int]:
+    """Where numbers do not exceed the ones before them.
+
+    >>> not_increasing(np.array([0.0, 0.1, 0.1, 0.2, 0.15]))
+    [2, 4]
+    """
+    return (np.flatnonzero(np.diff(numbers.astype(np.float64)) <= 0) + 1).tolist()

@@ -200,6 +200,8 @@ def broken(prepared, tmp_path, **changes):
         ({"poses": np.zeros((30, 24, 3)), "transl": np.zeros((30, 3)), "silhouette_iou": None, "video_frame": None},
          "images lacks the images of frames 23-29"),
         ({"transl": np.full((FRAMES, 3), [0, 0, -3.5])}, "has the body behind it at times 0-22"),
+        ({"seconds": np.zeros(3)}, "seconds in .* should be numbers of shape"),
+        ({"seconds": np.where(np.arange(FRAMES) == 7, 0.0, np.arange(FRAMES))}, "should increase .* not so at 7"),
     ],
 )  # fmt: skip
 def test_a_faulty_prepared_capture_is_one_sentence_and_leaves_nothing(prepared, tmp_path, changes, sentence):
@@ -358,6 +360,20 @@ def test_the_rate_is_given_or_read_or_said_to_be_assumed(prepared, tmp_path):
     assert len(said) == 1
     with pytest.raises(TwofoldError, match="makes no sense"):
         import_prepared(prepared, tmp_path / "d", fps=0.0)
+
+
+def test_times_of_frames_are_kept_where_the_rate_varies(prepared, tmp_path):
+    gaps = np.where(np.arange(FRAMES) % 3 == 0, 0.1, 0.04)
+    uneven = broken(prepared, tmp_path, seconds=5 + gaps.cumsum())
+    capture = read_capture(import_prepared(uneven, tmp_path / "a"))
+    assert np.allclose(capture.seconds_of(range(FRAMES)), gaps.cumsum() - gaps[0])
+    assert np.isclose(capture.fps, (FRAMES - 1) / gaps[1:].sum())
+    with pytest.raises(TwofoldError, match="leave --fps out"):
+        import_prepared(uneven, tmp_path / "b", fps=25.0)
+    shutil.rmtree(uneven)
+    even = broken(prepared, tmp_path, seconds=np.arange(FRAMES) / 12)
+    capture = read_capture(import_prepared(even, tmp_path / "c"))
+    assert (capture.fps, capture.seconds) == (pytest.approx(12), None)
 
 
 def test_what_prepare_reads_is_read_here_too(prepared, tmp_path):

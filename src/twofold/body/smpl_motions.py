@@ -14,7 +14,7 @@ from twofold.body.motion import Motion, evenly_timed, joint_frames, leg_length, 
 from twofold.body.skeleton import Body, ShapedBody, shape_body
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
-from twofold.npz import read_npz
+from twofold.npz import not_increasing, read_npz
 
 SMPL_LEG = 0.78
 """Thigh and shin of SMPL's mean body, metres; where a file's body is not known, its legs are taken to be so long."""
@@ -141,7 +141,7 @@ def _seconds(arrays: dict[str, np.ndarray], layout: Layout, frames: int, path: P
         return None
     seconds = arrays["seconds"]
     fits = seconds.dtype.kind in "fiu" and seconds.shape == (frames,) and bool(np.isfinite(seconds).all())
-    if not fits or (np.diff(seconds.astype(np.float64)) <= 0).any():
+    if not fits or not_increasing(seconds):
         raise TwofoldError(f"{path}: seconds should be {frames} increasing numbers, one for each frame.")
     return seconds.astype(np.float64)
 

@@ -21,7 +21,7 @@ from twofold.capture.types import SPLITS
 from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera
 from twofold.inputs import read_json, shown, shown_path, why_unreadable
-from twofold.npz import are_moderate, read_npz
+from twofold.npz import are_moderate, not_increasing, read_npz
 
 FORMAT, VERSION = "twofold-capture", 1
 DESCRIPTION, BODY, MOTION = "capture.json", "body.npz", "motion.npz"
@@ -354,10 +354,8 @@ def _read_motion(
         elif name.endswith("poses") and (turns := np.linalg.norm(array, axis=-1)).size and turns.max() > 4 * np.pi:
             bad = np.flatnonzero((turns > 4 * np.pi).any(-1)).tolist()
             faults.append(f"{MOTION}: {name} turns joints by more than two turns at times {spans(bad)}; give radians.")
-        elif name == "seconds" and (back := np.flatnonzero(np.diff(array.astype(float)) <= 0) + 1).size:
-            faults.append(
-                f"{MOTION}: seconds should increase from frame to frame; not so at times {spans(back.tolist())}."
-            )
+        elif name == "seconds" and (back := not_increasing(array)):
+            faults.append(f"{MOTION}: seconds should increase from frame to frame; not so at times {spans(back)}.")
         elif name == "seconds":
             read[name] = torch.as_tensor(array.astype(np.float64) - array[:1].astype(np.float64))
         else:

@@ -24,10 +24,11 @@ from twofold.errors import TwofoldError
 from twofold.geometry.cameras import Camera, project
 from twofold.geometry.upright import turn_world
 from twofold.images import read_header
-from twofold.npz import are_moderate, read_npz
+from twofold.npz import are_moderate, not_increasing, read_npz
 from twofold.prepare.detect.mask_values import MaskValues, mask_values, read_mask
 from twofold.prepare.output.held_objects import SeenBody, see_body, usual_colors
 from twofold.prepare.output.object_tracks import Sighting, foreign_patches, moving_objects, without
+from twofold.prepare.video.clips import are_uneven, rate_of
 from twofold.prepare.video.frames import ClipInfo, describe, picture_files, read_picture
 from twofold.prepare.video.numbering import numberings
 
@@ -35,7 +36,7 @@ CAMERA = "cam"
 ARRAYS = "capture.npz"
 _ARRAYS = (
     "intrinsics", "world_to_camera", "poses", "transl", "rest_vertices", "rest_joints", "parents", "weights", "faces",
-    "silhouette_iou", "video_frame", "fps",
+    "silhouette_iou", "video_frame", "fps", "seconds",
 )  # fmt: skip
 
 
@@ -67,7 +68,7 @@ def import_prepared(
         overwrite: a capture that lies at `out` is overwritten.
         held_objects: "remove" takes what is thick and sticks out of the body, such as a ball, out of the masks, and
             marks it and what passes in front of the body as ignored; "keep" leaves the masks as they are.
-        fps: frames per second; None takes `fps` of capture.npz, else 30, and says so.
+        fps: frames per second; None takes `seconds` or `fps` of capture.npz, else 30, and says so.
         credit: whom to name when showing the images.
         remark: called with each sentence that the user should know.
 
@@ -88,7 +89,7 @@ def import_prepared(
     if fps is not None and not 0.01 <= fps <= 1000:
         raise TwofoldError(f"The frame rate {fps:g} makes no sense; give frames per second, 10 for example.")
     arrays = _read_arrays(source)
-    fps = _rate(arrays, fps, remark)
+    fps, seconds = _times(arrays, fps, source / ARRAYS, remark)
     body, poses, translations = _to_t_pose(arrays)
     kept, left_out = _kept(arrays["silhouette_iou"], drop_below_iou)
     info = _described(source, len(poses), remark)
@@ -111,7 +112,7 @@ def import_prepared(
         whole = set(kept)
         if held_objects == "remove":
             files = _Files(images, masks, info, values)
-            for time, mask, hidden, share in _without_objects(body, poses, translations, camera, files, fps):
+            for time, mask, hidden, share in _without_objects(body, poses, translations, camera, files, seconds):
                 shares[time] = round(share, 4)
                 writer.mask(CAMERA, time, mask)
                 writer.ignored(CAMERA, time, hidden * np.uint8(255))
@@ -133,6 +134,7 @@ def import_prepared(
                 "novel_pose": {CAMERA: held_out},
             },
             fps=fps,
+            seconds=torch.from_numpy(seconds) if are_uneven(seconds) else None,
             credit=credit,
             notes={
                 "prepared_from": source.name,
@@ -155,12 +157,23 @@ def import_prepared(
     return out
 
 
-def _rate(arrays: dict[str, np.ndarray], fps: float | None, remark: Callable[[str], None]) -> float:
+def _times(
+    arrays: dict[str, np.ndarray], fps: float | None, where: Path, remark: Callable[[str], None]
+) -> tuple[float, Float[np.ndarray, "T"]]:
+    """Frames per second, and when each frame was taken."""
+    if (seconds := arrays.get("seconds")) is not None:
+        if fps is not None:
+            raise TwofoldError(f"{where} says when each frame was taken; leave --fps out.")
+        if back := not_increasing(seconds):
+            raise TwofoldError(f"seconds in {where} should increase from frame to frame; not so at {spans(back)}.")
+        seconds = seconds.astype(np.float64) - float(seconds[:1].sum())
+        return rate_of(seconds, USUAL_FPS), seconds
     if fps is None and "fps" in arrays and arrays["fps"].size == 1 and 0.01 <= float(arrays["fps"].item()) <= 1000:
         fps = float(arrays["fps"].item())
     if fps is None:
         remark(f"Nothing says how many frames a second there are; {USUAL_FPS:g} is taken, --fps sets it.")
-    return USUAL_FPS if fps is None else fps
+    fps = USUAL_FPS if fps is None else fps
+    return fps, np.arange(len(arrays["poses"])) / fps
 
 
 def _described(source: Path, frames: int, remark: Callable[[str], None]) -> ClipInfo:
@@ -236,7 +249,7 @@ def _without_objects(
     translations: Float[Tensor, "T 3"],
     camera: Camera,
     files: _Files,
-    fps: float,
+    seconds: Float[np.ndarray, "T"],
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"], float]]:
     """Time, mask without held objects, hidden pixels and their share of the mask, of frames with objects.
 
@@ -272,7 +285,7 @@ def _without_objects(
         seen = see(time)
         image, mask = files.read(time)
         sightings.append(None if seen is None else foreign_patches(mask, image, seen, usual, trusted))
-    for time, objects in zip(times, moving_objects(sightings, [time / fps for time in times]), strict=True):
+    for time, objects in zip(times, moving_objects(sightings, seconds[times].tolist()), strict=True):
         if objects:
             yield time, *without(files.read(time)[1], objects)
 
@@ -296,6 +309,7 @@ def _read_arrays(source: Path) -> dict[str, np.ndarray]:
         "intrinsics": (3, 3), "world_to_camera": (4, 4), "poses": (frames, 24, 3), "transl": (frames, 3),
         "rest_vertices": (vertices, 3), "rest_joints": (24, 3), "parents": (24,), "weights": (vertices, 24),
         "faces": (faces[0], 3), "silhouette_iou": (frames,), "video_frame": (frames,),
+        **({"seconds": (frames,)} if "seconds" in arrays else {}),
     }  # fmt: skip
     for name, shape in shapes.items():
         if name not in arrays:
