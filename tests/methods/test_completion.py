@@ -32,9 +32,9 @@ def runs(person, tmp_path_factory):
     return {on: train(person, recipe, folder / str(on), CPU) for on, recipe in recipes.items()}
 
 
-def outlining(method):
-    """The method with its shape completed by outlines."""
-    return replace(method, completion=replace(method.completion, outlines=1.0))
+def not_outlining(method):
+    """The method with its shape completed where no image shows it alone."""
+    return replace(method, completion=replace(method.completion, outlines=0.0))
 
 
 def prepared(person, change=lambda method: method):
@@ -219,7 +219,7 @@ def test_a_subject_that_is_nearly_all_observed_is_left_alone(person):
 
 def test_the_shape_of_what_was_seen_from_the_front_only_is_completed_from_the_outlines(person):
     """A front that bulges, as it may before one camera, where outlines say that the surface is 1 cm from the body."""
-    completion = prepared(person, outlining).completion
+    completion = prepared(person).completion
     on = completion._on_surface()
     placed = torch.from_numpy(on.shape_fill.weight)
     on_outline = placed > 0
@@ -236,7 +236,7 @@ def test_the_shape_of_what_was_seen_from_the_front_only_is_completed_from_the_ou
 
 
 def test_shape_is_completed_where_all_colours_were_observed_but_outlines_lack(person, generator):
-    avatar = outlining(completing_recipe(1).method).build(Subject.of(person))
+    avatar = completing_recipe(1).method.build(Subject.of(person))
     coverage, completion = coverage_of(person), avatar.completion
     ones = torch.ones_like(coverage.weight)
     completion.prepare(replace(coverage, weight=ones), torch.zeros_like(ones))
@@ -264,12 +264,12 @@ def test_a_share_too_small_for_targets_has_no_terms(person, generator):
 
 
 def test_without_that_setting_outlines_change_nothing(person):
-    completion = prepared(person).completion
+    completion = prepared(person, not_outlining).completion
     on = completion._on_surface()
     assert on.shape_fill is on.fill
     assert torch.equal(on.shape_ends, on.ends)
     assert completion.unplaced == completion.unobserved
-    assert prepared(person, outlining).completion.unplaced > completion.unobserved
+    assert prepared(person).completion.unplaced > completion.unobserved
 
 
 def test_runs_of_before_complete_the_shape_where_they_complete_the_colours(person):

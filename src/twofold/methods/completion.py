@@ -51,8 +51,7 @@ class CompletionConfig:
     """Weight of the squared difference to the completed distance, centimetres."""
     outlines: float = 0.0
     """How strongly the shape is completed where images show the body but no outline does, 0 to 1 times as strongly as
-    where no image shows it: before few cameras only outlines say how thick limbs are. For poses as good as a fit to
-    several cameras; where poses are rough, outlines and masks disagree."""
+    where no image shows it: before few cameras only outlines say how thick limbs are."""
     light: float = 0.0
     """Weight of what is not linear in the normal in the law of light, for fields that have one; 0.1 cost 0.2 dB of the
     training images of a synthetic subject, and gained nothing."""

@@ -19,7 +19,7 @@ from twofold.sampling.error_bounded import ErrorBoundedSampler
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.shell_sampler import ShellSampler
 
-COMPLETING = CompletionConfig(color=2.0, shape=0.04)
+COMPLETING = CompletionConfig(color=2.0, shape=0.04, outlines=1.0)
 """Completion of unobserved regions as `--complete on` asks for it."""
 
 
