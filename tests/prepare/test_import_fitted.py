@@ -324,7 +324,9 @@ def test_the_rate_is_given_or_read_or_said_to_be_assumed(prepared, tmp_path):
 def test_times_of_frames_are_kept_where_the_rate_varies(prepared, tmp_path):
     gaps = np.where(np.arange(FRAMES) % 3 == 0, 0.1, 0.04)
     uneven = broken(prepared, tmp_path, seconds=5 + gaps.cumsum())
-    capture = read_capture(import_prepared(uneven, tmp_path / "a"))
+    said = []
+    capture = read_capture(import_prepared(uneven, tmp_path / "a", remark=said.append))
+    assert said == ["capture.npz says when each frame was taken: 16.9 frames a second on average."]
     assert np.allclose(capture.seconds_of(range(FRAMES)), gaps.cumsum() - gaps[0])
     assert np.isclose(capture.fps, (FRAMES - 1) / gaps[1:].sum())
     with pytest.raises(TwofoldError, match="leave --fps out"):

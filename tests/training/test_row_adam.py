@@ -253,7 +253,7 @@ def test_a_training_that_sees_poses_seldom_says_so(person, recipe, tmp_path):
 
     def said(steps, avatar=avatar, images=1):
         training = replace(recipe.training, steps=steps, images_per_step=images)
-        return few_visits(avatar.parameter_groups(), training, person.train)
+        return few_visits(avatar.parameter_groups(), training, times)
 
     assert said(6 * times) is None
     assert said(2 * times, images=3) is None
@@ -267,4 +267,4 @@ def test_a_training_that_sees_poses_seldom_says_so(person, recipe, tmp_path):
     spoken = []
     short = replace(recipe, method=method, training=replace(recipe.training, steps=2))
     loop.train(person, short, tmp_path / "run", torch.device("cpu"), say=spoken.append)
-    assert few_visits(avatar.parameter_groups(), short.training, person.train) in spoken
+    assert few_visits(avatar.parameter_groups(), short.training, times) in spoken

@@ -129,7 +129,7 @@ class SurfaceFill:
         behind = (self.group == TRUNK) & (self.along > neckline)
         self._ring_at = np.where(behind, 2 * neckline - self.along, self.along)
         # What hangs between the legs in front is no measure of the buttocks; the thighs beside them are.
-        self._ringed = np.where(self.group == LEGS, TRUNK, self.group)
+        self._ring_group = np.where(self.group == LEGS, TRUNK, self.group)
         self.hairy, self.crown = (self.samples.at(values) for values in self._hair_regions())
         self._head_height = self.samples.at(self._head_heights()[0])
         self._trust = self.weight * self.samples.area
@@ -180,7 +180,7 @@ class SurfaceFill:
         self, values: Float[np.ndarray, "n C"], ring: float = RING, faint: float | None = FAINT
     ) -> Float[np.ndarray, "n C"]:
         """Each sample's mirror image by how well it was seen; for the rest its ring (`ring_medians`), or the hair."""
-        around = ring_medians(values, self._beside, self._ringed, self.along, ring, ENOUGH, self._ring_at, faint)
+        around = ring_medians(values, self._beside, self._ring_group, self.along, ring, ENOUGH, self._ring_at, faint)
         alone = around + self.hairy[:, None] * (self._hair(values) - around)
         return alone + self._seen_there[:, None] * (values[self._mirrored] - alone)
 

@@ -99,14 +99,14 @@ def weighted_median(values: Float[np.ndarray, "n C"], weight: Float[np.ndarray, 
 
 
 def without_faint_bands(
-    table: Float[np.ndarray, "r C"], places: Float[np.ndarray, "r"], contrast: float
+    table: Float[np.ndarray, "r C"], places: Float[np.ndarray, "r"], faint: float
 ) -> Float[np.ndarray, "r C"]:
-    r"""Values along a part without faint bands: a bilateral filter, which leaves steps that are higher than a contrast.
+    r"""Values along a part without faint bands: a bilateral filter, which leaves higher steps.
 
     \[ v_i \leftarrow \frac{\sum_j w_{ij} v_j}{\sum_j w_{ij}}, \qquad
     w_{ij} = \exp \Big( -\frac{(a_i - a_j)^2}{2 b^2} - \frac{\lVert v_i - v_j \rVert^2}{2 C \tau^2} \Big) \]
 
-    `PASSES` times, with the places $a$, the width $b$ of `BAND` and the contrast $\tau$.
+    `PASSES` times, with the places $a$, the width $b$ of `BAND` and the height $\tau$ of what is faint.
 
     >>> places = np.arange(30) / 100
     >>> hem, fold = (places > 0.145) * 0.5, (np.abs(places - 0.15) < 0.02) * 0.05
@@ -118,12 +118,12 @@ def without_faint_bands(
     Args:
         table: values by place.
         places: metres.
-        contrast: $\tau$, in units of the values, root mean square over the columns.
+        faint: $\tau$, in units of the values, root mean square over the columns.
     """
     near = -((places[:, None] - places) ** 2) / (2 * BAND**2)
     for _ in range(PASSES):
         apart = ((table[:, None] - table) ** 2).mean(-1)
-        weight = np.exp(near - apart / (2 * contrast**2))
+        weight = np.exp(near - apart / (2 * faint**2))
         table = weight @ table / weight.sum(1, keepdims=True)
     return table
 
@@ -131,7 +131,7 @@ def without_faint_bands(
 def ring_medians(
     values: Float[np.ndarray, "n C"], trust: Float[np.ndarray, "n"], group: Int[np.ndarray, "n"],
     along: Float[np.ndarray, "n"], height: float, enough: float, asked: Float[np.ndarray, "n"] | None = None,
-    contrast: float | None = None,
+    faint: float | None = None,
 ) -> Float[np.ndarray, "n C"]:  # fmt: skip
     r"""For each point the median of what was observed of the same body part at the same height, on either side.
 
@@ -152,7 +152,7 @@ def ring_medians(
         height: of a ring, metres.
         enough: observed area that a ring needs, square metres.
         asked: the place whose ring each point takes, metres; None for its own.
-        contrast: rings whose values differ by less than about this, over less than `BAND`, become alike
+        faint: rings whose values differ by less than about this, over less than `BAND`, become alike
             (`without_faint_bands`); None leaves them.
     """
     at = along if asked is None else asked
@@ -167,8 +167,8 @@ def ring_medians(
         if pieces:
             places = np.array([along[piece].mean() for piece in pieces])
             table = np.array([weighted_median(values[piece], trust[piece]) for piece in pieces])
-            if contrast is not None:
-                table = without_faint_bands(table, places, contrast)
+            if faint is not None:
+                table = without_faint_bands(table, places, faint)
             out[own] = np.stack([np.interp(at[own], places, column) for column in table.T], -1)
     return out
 

@@ -166,8 +166,10 @@ def _times(
             raise TwofoldError(f"{where} says when each frame was taken; leave --fps out.")
         if back := not_increasing(seconds):
             raise TwofoldError(f"seconds in {where} should increase from frame to frame; not so at {spans(back)}.")
-        seconds = seconds.astype(np.float64) - float(seconds[:1].sum())
-        return rate_of(seconds, USUAL_FPS), seconds
+        seconds = seconds.astype(np.float64) - seconds[:1]
+        rate = rate_of(seconds, USUAL_FPS)
+        remark(f"{where.name} says when each frame was taken: {rate:.3g} frames a second on average.")
+        return rate, seconds
     if fps is None and "fps" in arrays and arrays["fps"].size == 1 and 0.01 <= float(arrays["fps"].item()) <= 1000:
         fps = float(arrays["fps"].item())
     if fps is None:

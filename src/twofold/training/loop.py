@@ -199,7 +199,7 @@ def train(
             require_free(folder)
         avatar = recipe.method.build(subject, recipe.seed).to(device)
         found = None if resume else avatar.check_capture(capture)
-        seldom = few_visits(avatar.parameter_groups(), avatar.stages(config)[-1].training, capture.train)
+        seldom = few_visits(avatar.parameter_groups(), avatar.stages(config)[-1].training, len(subject.times))
         first = before_first(avatar) if before_first else None
         notes = [note for note in (first, found, settled, seldom) if note]
         if wants_compiling(config, device):

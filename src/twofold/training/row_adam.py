@@ -1,14 +1,13 @@
 """Adam whose large tables are updated row by row, and whose rows may each have means of their own."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from twofold.capture.types import Frame
 from twofold.kernels.row_gradient import RowGradient, adam_rows
 from twofold.methods.base import Avatar
 from twofold.methods.parameter_group import ParameterGroup
@@ -96,17 +95,14 @@ def shrink(
     return step * (1 - shrinkage / ratio.clamp_min(1e-6)).clamp_min(0)
 
 
-def few_visits(
-    groups: Iterable[ParameterGroup], training: TrainingConfig, frames: Sequence[Frame]
-) -> str | None:  # fmt: skip
+def few_visits(groups: Iterable[ParameterGroup], training: TrainingConfig, times: int) -> str | None:
     """What to tell the user where corrections of poses shrink and frames are visited too seldom for that; else None.
 
     Args:
         groups: of the avatar.
         training: steps and images a step.
-        frames: to be trained on; those of one time, from several cameras, share a correction.
+        times: that the training images show; images of one time, from several cameras, share a correction.
     """
-    times = len({frame.frame_index for frame in frames})
     visits = training.steps * training.images_per_step / times
     if visits >= FEW_VISITS or not any(group.shrinkage and group.parameters for group in groups):
         return None
