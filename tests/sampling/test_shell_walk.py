@@ -120,7 +120,7 @@ def test_samples_seen_on_the_way_are_the_visible_ones_of_all(started, beta, radi
     walk, beta = walk_of(started, 0.011), torch.tensor(beta)
     whole, all_asked, asked = walk.whole(), BallField(avatar, radius), BallField(avatar, radius)
     with torch.no_grad():
-        wanted = whole[visible(whole.samples, whole.x_canonical, len(rays), all_asked, beta, 2e-3)]
+        wanted = whole[visible(whole.samples, whole.x_canonical, len(rays), FieldQuery(all_asked, beta), 2e-3)]
         ours = walk.seen(FieldQuery(asked, beta), 2e-3, share=0.0)
     mine, theirs = by_place(ours), by_place(wanted)
     # Light is multiplied in another order, which decides about samples that are just seen or just not.
@@ -194,6 +194,26 @@ def test_a_grid_finds_the_samples_that_the_field_would_find(started, beta, radiu
     here, there = (torch.tensor([table[key] for key in both]) for table in keys)
     for name in ("nearest", "weights", "x_canonical", "inverse"):
         torch.testing.assert_close(getattr(found, name)[here], getattr(every, name)[there])
+
+
+def test_a_grid_alone_chooses_where_queries_are_costly(started):
+    avatar, _, rays = started
+    walk, beta, field = walk_of(started, 0.011), torch.tensor(0.003), BallField(avatar, 0.02)
+    with torch.no_grad():
+        grid = tabulate(field, avatar.canonical_points, 0.015, 0.09, covered=0.75)
+        asked = BallField(avatar, 0.02)
+        alone = walk.seen(FieldQuery(asked, beta, costly=True), 2e-3, 0.7, 0.0, grid)
+        every = walk.whole()
+        other = every[
+            visible(every.samples, every.x_canonical, len(rays), FieldQuery(asked, beta, (), True), 2e-3, grid)
+        ]
+        exact = walk.seen(FieldQuery(BallField(avatar, 0.02), beta), 2e-3, 0.7)
+    assert asked.asked == 0
+    # As on GPUs, but for where light is multiplied in another order; nearly all that queries find, and some more.
+    chosen = [set(by_place(placed)) for placed in (alone, other, exact)]
+    assert len(chosen[0] ^ chosen[1]) <= 0.01 * len(chosen[1])
+    assert len(chosen[2] - chosen[0]) <= 0.02 * len(chosen[2])
+    assert len(chosen[0]) < 1.5 * len(chosen[2])
 
 
 def test_a_grid_that_knows_nothing_leaves_everything_to_the_field(started):

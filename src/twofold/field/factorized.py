@@ -120,11 +120,13 @@ class FactorizedFieldConfig:
         return FactorizedField(self, pose_size, generator)
 
 
+_Branches = tuple[ReadyBranch | None, ReadyBranch | None]
+"""The pose-independent and the pose-dependent branch at one pose."""
+
+
 class FactorizedField(DenseField):
     """Signed distance and colour at points of canonical space, for one pose at a time."""
 
-    dense = True
-    """Each query passes through large networks."""
     separates_light = False
     """Colours include the lighting."""
 
@@ -136,19 +138,6 @@ class FactorizedField(DenseField):
         self.low = self._networks("low", pose_size, generator) if has_low else None
         self.high = self._networks("high", pose_size, generator) if has_high else None
 
-    def sdf(self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]) -> Float[Tensor, "S"]:
-        """The distance that `forward` gives, alone; about a third of its cost."""
-        low, high = self.at(pose)
-        s1 = s2 = None
-        handed: list[Tensor] = []
-        if low is not None:
-            answer = low.sdf(self._encoded(x_canonical, self.config.low_octaves), None if self.handed else 1)
-            s1, handed = answer[:, 0], [answer[:, 1:]] if self.handed else []
-        if high is not None:
-            encoded = self._encoded(x_canonical, self.config.high_octaves)
-            s2 = high.sdf(torch.cat([encoded, *handed], -1), 1)[:, 0]
-        return self._shown(s1, s2, s1)
-
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters of the "low" and of the "high" branch, which learn at different rates; empty for one left out."""
         branches = {"low": self.low, "high": self.high}
@@ -158,9 +147,22 @@ class FactorizedField(DenseField):
         """Not to be had: the networks' colours include the lighting."""
         raise ValueError("colours of dense networks include the lighting; ask for them with lit=True")
 
-    def at(self, pose: Float[Tensor, "P"]) -> tuple[ReadyBranch | None, ReadyBranch | None]:
-        """Both branches at one pose; their matrices are multiplied out here, once a call."""
+    def at(self, pose: Float[Tensor, "P"]) -> _Branches:
+        """See `DenseField.at`: both branches."""
         return None if self.low is None else self.low.at(pose), None if self.high is None else self.high.at(pose)
+
+    def _sdf(self, x: Float[Tensor, "S 3"], networks: _Branches) -> Float[Tensor, "S"]:
+        """See `DenseField._sdf`."""
+        low, high = networks
+        s1 = s2 = None
+        handed: list[Tensor] = []
+        if low is not None:
+            answer = low.sdf(self._encoded(x, self.config.low_octaves), None if self.handed else 1)
+            s1, handed = answer[:, 0], [answer[:, 1:]] if self.handed else []
+        if high is not None:
+            encoded = self._encoded(x, self.config.high_octaves)
+            s2 = high.sdf(torch.cat([encoded, *handed], -1), 1)[:, 0]
+        return self._shown(s1, s2, s1)
 
     def base_branch(
         self, x: Float[Tensor, "S 3"], networks: ReadyBranch, to_observation: Float[Tensor, "S 3 3"] | None
@@ -222,11 +224,11 @@ class FactorizedField(DenseField):
         return base + (gate[:, None] if base.dim() == 2 else gate) * detail
 
     def _evaluate(
-        self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"], to_observation: Float[Tensor, "S 3 3"] | None
+        self, x: Float[Tensor, "S 3"], networks: _Branches, to_observation: Float[Tensor, "S 3 3"] | None
     ) -> FieldOutput:
         """See `DenseField._evaluate`; `normals` says whether the colour networks see normals of observation space."""
         to_observation = to_observation if self.config.normals == "observation" else None
-        low, high = self.at(pose)
+        low, high = networks
         base = None if low is None else self.base_branch(x, low, to_observation)
         below = None if base is None else self._output(base, None)
         if high is not None:
@@ -248,10 +250,10 @@ class FactorizedField(DenseField):
         )
 
     def _distance_and_gradient(
-        self, x: Float[Tensor, "S 3"], pose: Float[Tensor, "P"]
+        self, x: Float[Tensor, "S 3"], networks: _Branches
     ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
         """See `DenseField._distance_and_gradient`."""
-        low, high = self.at(pose)
+        low, high = networks
         base = None if low is None else self._geometry(self._encoded(x, self.config.low_octaves), None, low)
         detail = None if high is None else self._geometry(self._encoded(x, self.config.high_octaves), base, high)
         s1 = None if base is None else base.sdf
@@ -318,10 +320,12 @@ class FactorizedField(DenseField):
             start="sphere",
             radius=config.radius,
             hidden_dtype=config.hidden_dtype,
+            exact_inputs=columns,
             native_softplus=config.gradients == "autograd",
         )
+        exact = (3 if config.color_sees_position else 0) + 3
         color = NetworkConfig(
-            inputs=(3 if config.color_sees_position else 0) + 3 + config.width + (color_feature if handed else 0),
+            inputs=exact + config.width + (color_feature if handed else 0),
             outputs=3,
             depth=config.low_color_depth if is_low else config.high_color_depth,
             width=config.width,
@@ -329,6 +333,7 @@ class FactorizedField(DenseField):
             activation="relu",
             weight_norm=config.weight_norm,
             hidden_dtype=config.hidden_dtype,
+            exact_inputs=exact,
         )
         pose_code = config.pose_code if posed else None
         return BranchNetworks(sdf, color, pose_code, config.feature_code if handed else None, generator)

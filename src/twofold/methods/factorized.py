@@ -100,7 +100,7 @@ class FactorizedAvatar(SkinnedAvatar[FactorizedConfig, FactorizedField | GridFie
 
     def compiled(self) -> AbstractContextManager[bool]:
         """See `Avatar.compiled`. Feature grids have compiled loops of their own."""
-        return compiled_methods(self.field, ("forward", "sdf", "distance_and_gradient") if self.field.dense else ())
+        return compiled_methods(self.field, ("forward", "_sdf", "distance_and_gradient") if self.field.dense else ())
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The field's groups, "beta" and "pose"."""

@@ -300,7 +300,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
     def place(self, rays: Rays, posed: Posed, mode: Mode, generator: torch.Generator | None) -> Placement:
         """The samples that `render` shades."""
         version = (self._steps, *(parameter._version for parameter in self.field.parameters()))
-        query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, version)
+        query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, version, costly=self.field.dense)
         placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
         shading = self.config.outliers_in_shading and not mode.training
         return placed if shading else replace(placed, outlier=torch.zeros_like(placed.outlier))

@@ -84,7 +84,13 @@ class SkinnedConfig(MethodConfig):
 
 
 class CanonicalField(Protocol):
-    """A field of canonical space, conditioned on the pose."""
+    """A field of canonical space, conditioned on the pose.
+
+    Attributes:
+        dense: each query passes through large networks.
+    """
+
+    dense: bool
 
     def __call__(
         self, x_canonical: Float[Tensor, "S 3"], pose: Float[Tensor, "P"],

@@ -41,11 +41,14 @@ class FieldQuery:
         distance: signed distance at canonical points, metres.
         beta: scale of the Laplace density, metres.
         version: changes whenever the field's parameters do.
+        costly: a query costs a third of what shading the sample does, or more: where a grid of distances has chosen the
+            samples, they are not chosen once more by queries.
     """
 
     distance: Distance
     beta: Float[Tensor, ""]
     version: tuple[int, ...] = ()
+    costly: bool = False
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from torch import Tensor
 from twofold.geometry.cameras import Rays
 from twofold.kernels.parallel import in_parts
 from twofold.sampling import shell_kernels
-from twofold.sampling.placement import Placement
+from twofold.sampling.placement import FieldQuery, Placement
 from twofold.sampling.posed_surface import PosedSurface
-from twofold.sampling.sdf_grid import Distance, SdfGrid
+from twofold.sampling.sdf_grid import SdfGrid
 from twofold.sampling.shell import Shell, nearest_listed, shell_arrays
 from twofold.sampling.visibility import possible_samples, seen_samples
 from twofold.volume.rendering import laplace_density
@@ -46,8 +46,8 @@ def miswarped(
 
 @torch.no_grad()
 def visible(
-    samples: Samples, x_canonical: Float[Tensor, "S 3"], rays: int, distance: Distance, beta: Float[Tensor, ""],
-    min_weight: float, grid: SdfGrid | None = None,
+    samples: Samples, x_canonical: Float[Tensor, "S 3"], rays: int, query: FieldQuery, min_weight: float,
+    grid: SdfGrid | None = None,
 ) -> Int[Tensor, "n"]:  # fmt: skip
     """Which of the samples add more than `min_weight` to their pixel.
 
@@ -55,18 +55,21 @@ def visible(
         samples: all of them.
         x_canonical: where these are in canonical space, metres.
         rays: how many these lie on.
-        distance: of the field, metres.
-        beta: scale of the density, metres.
+        query: of the field.
         min_weight: a weight (`composite_weights`).
-        grid: of the same field in the same pose; what it shows to be empty or hidden is not queried.
+        grid: of the same field in the same pose; what it shows to be empty or hidden is not queried, and nothing at all
+            where queries are costly.
     """
+    beta = query.beta
     queried = torch.arange(len(x_canonical), device=x_canonical.device)
     if grid is not None:
         nearer, further = grid.bounds(x_canonical)
         largest, smallest = laplace_density(nearer, beta), laplace_density(further, beta)
         queried = possible_samples(samples, smallest, largest, min_weight).nonzero()[:, 0]
+        if query.costly:
+            return queried
 
     def density(index: Tensor) -> Tensor:
-        return laplace_density(distance(x_canonical[index if grid is None else queried[index]]), beta)
+        return laplace_density(query.distance(x_canonical[index if grid is None else queried[index]]), beta)
 
     return queried[seen_samples(samples if grid is None else samples[queried], density, rays, min_weight)]

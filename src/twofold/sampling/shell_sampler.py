@@ -25,6 +25,10 @@ _GRID_PAYS = 150_000
 _COVERED = 0.99
 """Share of places at which the bounds of that grid hold: with those of all places it would rule out few samples."""
 
+_COVERED_ALONE = 0.75
+"""The same where the grid alone chooses the samples (`FieldQuery.costly`). Of paper-size networks with a density scale
+of 3 mm it chooses a fifth more samples than queries would, and colours are no further from those of all samples."""
+
 
 @dataclass(frozen=True)
 class ShellSampler:
@@ -113,9 +117,7 @@ class ShellPlacer:
             return walk.seen(query, least, self.config.leap, self.config.finest, grid)
 
         def seen(placed: Placement) -> Placement:
-            return placed[
-                visible(placed.samples, placed.x_canonical, len(rays), query.distance, query.beta, least, grid)
-            ]
+            return placed[visible(placed.samples, placed.x_canonical, len(rays), query, least, grid)]
 
         placed = seen(self.well_warped(rays, surface, generator))
         parts = parts_of_step(self.config.step, float(query.beta.detach()), self.config.finest)
@@ -198,8 +200,7 @@ class ShellPlacer:
             return self._last_grid[2]
         if expected_samples(shell, rays, self.config.step) < _GRID_PAYS * (0.015 / voxel) ** 3:
             return None
-        grid = tabulate(
-            query.distance, self._canonical.to(surface.forward.device), voxel, self.config.radius, covered=_COVERED
-        )
+        points, covered = self._canonical.to(surface.forward.device), _COVERED_ALONE if query.costly else _COVERED
+        grid = tabulate(query.distance, points, voxel, self.config.radius, covered=covered)
         self._last_grid = (surface, query.version, grid)
         return grid

@@ -109,7 +109,7 @@ class Walk:
             finest: the steps of the samples found are divided until these are at most $2 \beta$ long, or this, metres;
                 0 leaves them.
             grid: of the field's distances. Rays are followed by it, and the field is queried only where samples may
-                count.
+                count, or not at all if that is costly.
         """
         parts = parts_of_step(self.step, float(query.beta.detach()), finest)
         if grid is None:
@@ -127,6 +127,8 @@ class Walk:
         """`seen`, of which every sample is looked at, in one go, unless a grid knows that it does not count."""
         found = self._mapped(np.arange(len(self.on_rays[0])))[:_GOOD]
         queried = np.arange(len(found[0])) if grid is None else self._possible(grid, found, query, least)
+        if grid is not None and query.costly:
+            return self._placement(*(array[queried] for array in found))
         through = np.ones(len(self.ray_ids), np.float32)
         number, point, away = (found[part][queried] for part in _FOLLOWED)
         seen = queried[self._follow(number, point, away, query, least, through, None)]
