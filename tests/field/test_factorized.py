@@ -367,8 +367,12 @@ def test_compiles_into_one_graph_with_first_order_training():
         def loss(field, x, pose, matrix):
             out = field(x, pose, matrix)
             return out.color.mean() + out.base.color.mean() + (out.gradient.norm(dim=1) - 1).square().mean()
-        compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
-        pairs = [torch.autograd.grad(f(field, x, pose, matrix), list(field.parameters())) for f in (loss, compiled)]
-        torch.testing.assert_close(*pairs)
+        for dynamic in (None, True):
+            torch._dynamo.reset()
+            compiled = torch.compile(loss, backend="aot_eager", fullgraph=True, dynamic=dynamic)
+            for rows in (8, 5):  # As many samples as a step happens to have.
+                given = field, x[:rows], pose, matrix[:rows]
+                pairs = [torch.autograd.grad(f(*given), list(field.parameters())) for f in (loss, compiled)]
+                torch.testing.assert_close(*pairs)
     """
     subprocess.run([sys.executable, "-c", textwrap.dedent(program)], check=True, timeout=120)

@@ -46,12 +46,15 @@ def test_settings_that_a_stored_recipe_lacks_are_what_was_done_before(name):
 def test_quick_of_then_is_quick_of_now_but_for_these_settings():
     stored = json.loads((STORED / "quick.json").read_text())
     read = recipe_from_dict(stored, "here")
-    losses = dataclasses.replace(read.method.losses, base_mask=0.3)  # since then the base branch has a mask term
+    # Since then the base branch has a mask term, and rays in random orders a structural one.
+    losses = dataclasses.replace(read.method.losses, base_mask=0.3, s3im=0.3)
     # Since then corrections leave alone what no camera sees, average what a frame's images say, and shrink
     # where that is noise.
     pose = dataclasses.replace(read.method.pose, observed_only=True, averages="visits", shrinkage=1.5)
-    # Since then rays leap through empty space, and steps near the surface are divided.
-    sampler = dataclasses.replace(read.method.sampler, leap=0.7, finest=quick().method.sampler.finest)
+    # Since then rays leap through empty space, steps near the surface are divided, and a grid finds the samples.
+    now = quick().method.sampler
+    grid = {"training_grid_every": now.training_grid_every}
+    sampler = dataclasses.replace(read.method.sampler, leap=0.7, finest=now.finest, **grid)
     rates = dataclasses.replace(read.method.rates, pose=3e-3)
     # Since then grids become as fine as the images, and the fine networks see fewer numbers of the pose.
     field = dataclasses.replace(read.method.field, follow_images=True, pose_code=2)

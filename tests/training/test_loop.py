@@ -192,7 +192,7 @@ def test_networks_run_compiled_where_the_recipe_asks_for_it_and_the_run_says_so(
     avatar = train(person, dense(1, choice), tmp_path / "run", CPU, say=said.append)
     assert wanted == [{"dynamic": True}] * (3 if compiled else 0)
     notes = [COMPILED] * compiled
-    assert set(ran) == ({"forward", "sdf", "distance_and_gradient"} if compiled else set())
+    assert set(ran) == ({"forward", "_sdf", "distance_and_gradient"} if compiled else set())
     assert said == [*notes, coverage_of(person).sentence()]
     assert json.loads((tmp_path / "run" / "run.json").read_text())["notes"] == notes
     assert not {"forward", "sdf"} & set(vars(avatar.field))

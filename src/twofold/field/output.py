@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,16 @@ class FieldOutput:
     color: Float[Tensor, "S 3"]
     gradient: Float[Tensor, "S 3"] | None
     base: "FieldOutput | None" = None
+
+    def normals(self, to_observation: Float[Tensor, "S 3 3"]) -> Float[Tensor, "S 3"]:
+        """Unit normals of observation space: the gradients turned by `to_observation`.
+
+        Raises:
+            ValueError: nobody asked for gradients.
+        """
+        if self.gradient is None:
+            raise ValueError("normals need the gradient of the distance; this field gave none")
+        return F.normalize((to_observation * self.gradient[:, None]).sum(-1), dim=-1, eps=1e-6)
 
 
 @dataclass(frozen=True)

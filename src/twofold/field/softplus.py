@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from twofold.field import softplus_kernels as kernels
 from twofold.kernels.lanes import LANES
@@ -30,6 +31,11 @@ def softplus(z: Float[Tensor, "*b"]) -> tuple[Float[Tensor, "*b"], Float[Tensor,
     >>> softplus(torch.tensor([0.0, 2.0]))
     (tensor([0.0069, 2.0000]), tensor([0.5000, 1.0000]))
     """
+    if torch.compiler.is_compiling():
+        # A compiler fuses these, and with changing sizes it refuses functions that bring their own reverse pass, one
+        # after the other.
+        wide = z.float() if z.dtype == torch.bfloat16 else z
+        return F.softplus(wide, beta=SHARPNESS).to(z.dtype), torch.sigmoid(SHARPNESS * wide).to(z.dtype)
     value, slope = _Softplus.apply(z)
     return value, slope
 
@@ -65,7 +71,7 @@ class _Softplus(torch.autograd.Function):
 def _has_kernel(z: Tensor) -> bool:
     """Whether the compiled loops can be used; of a second derivative, and where torch compiles, they cannot."""
     known = z.dtype in (torch.float32, torch.bfloat16) and not z.is_cuda and z.numel() >= LANES
-    return known and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
+    return known and not torch.is_grad_enabled()
 
 
 def _flat(tensor: Tensor) -> np.ndarray:

@@ -114,13 +114,15 @@ def quick() -> Recipe:
         name="quick",
         method=FactorizedConfig(
             field=GridFieldConfig(follow_images=True),
-            sampler=ShellSampler(radius=0.06, step=0.01, min_weight=2e-3, miswarp_slack=0.006, finest=0.0025),
+            sampler=ShellSampler(
+                radius=0.06, step=0.01, min_weight=2e-3, miswarp_slack=0.006, finest=0.0025, training_grid_every=50
+            ),
             losses=LossConfig(
                 eikonal=0.05,
                 mask=0.3,
                 base_mask=0.3,
                 mask_form="mean",
-                s3im=0.0,
+                s3im=0.3,
                 lpips=0.0,
                 common=0.5,
                 eikonal_points=512,

@@ -84,6 +84,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         self._perceptual: tuple[LPIPS, ...] = ()
         self.deformation = Deformation(config.falloff, config.outlier_distance / self.scale, self.scale)
         self._sampler: Sampler = config.sampler.build(self.deformation, canonical.canonical_vertices, canonical.faces)
+        self.training_grid = self._sampler.training_grid
         self.completion: Completion | None = None
         if config.completion.active:
             self.completion = Completion(config.completion, given, canonical.canonical_vertices)
@@ -106,6 +107,8 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
 
     def load_stored(self, state: dict[str, Tensor]) -> None:
         """See `Avatar.load_stored`."""
+        if self.training_grid is not None:
+            self.training_grid.take_on(state, "training_grid.")
         if self.completion is not None:
             self.completion.take_on(state, "completion.")
 
@@ -158,18 +161,25 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         refresh, step = self.config.shell_refresh, mode.step or 0
         if self.refinement.parts and step and step % refresh == 0 and step >= self.config.pose.refine_from:
             with torch.no_grad():
-                self._follow(*self._refined())
+                self._follow(*self._all_refined())
+        if (grid := self.training_grid) is not None and grid.is_due(step):
+            pose = self._refined(step // grid.every % len(self.subject.times))[0].detach()
+            grid.refresh(self.field.sdf_at(condition(self.config.pose, pose, step, epoch)))
         if (own := self.completion) is not None and own.is_due(step):
             # In the first frame's pose, whatever this step shows: so any number of processes find the same.
             subject = self.subject
             posed = self.pose(subject.poses[0], subject.translations[0], int(subject.times[0]), mode)
             own.refresh(lambda x, v: self.answer_beside(x, v, posed), self.light_beside(own.beside, posed))
 
-    def _refined(self) -> tuple[Tensor, Tensor]:
+    def _all_refined(self) -> tuple[Tensor, Tensor]:
         """Poses and translations of all training frames with their corrections."""
-        given = zip(self.subject.times, self.subject.poses, self.subject.translations, strict=True)
-        found = [self.refinement(int(time), p.to(self.device), t.to(self.device)) for time, p, t in given]
+        found = [self._refined(row) for row in range(len(self.subject.times))]
         return torch.stack([pose for pose, _ in found]), torch.stack([translation for _, translation in found])
+
+    def _refined(self, row: int) -> tuple[Tensor, Tensor]:
+        """Pose and translation of a training frame with their corrections."""
+        own, device = self.subject, self.device
+        return self.refinement(int(own.times[row]), own.poses[row].to(device), own.translations[row].to(device))
 
     def _follow(self, poses: Tensor, translations: Tensor) -> None:
         """Gives up the shells of bodies that have moved by more than `SHELL_MARGIN`, half of it left to the shape."""
@@ -289,18 +299,20 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         x_canonical, by_posed = placed.differentiable(posed.own.surface)
         to_observation = self._normal_matrices(x_canonical, by_posed, posed)
         answer = self.field(x_canonical, posed.own.condition, to_observation)
-        normals = _normals(to_observation, answer)
+        normals = answer.normals(to_observation)
         whole = self._composite(answer, normals, samples, outlier, behind, rays)
         if answer.base is None:
             return whole
         # The base rendering's normals are its own branch's, at the same samples.
-        base_normals = _normals(to_observation, answer.base)
-        return replace(whole, base=self._composite(answer.base, base_normals, samples, outlier, behind, rays))
+        normals = answer.base.normals(to_observation)
+        return replace(whole, base=self._composite(answer.base, normals, samples, outlier, behind, rays))
 
     def place(self, rays: Rays, posed: Posed, mode: Mode, generator: torch.Generator | None) -> Placement:
         """The samples that `render` shades."""
         version = (self._steps, *(parameter._version for parameter in self.field.parameters()))
-        query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, version, costly=self.field.dense)
+        lately = self.training_grid.grid() if mode.training and self.training_grid is not None else None
+        costly = self.field.dense and not mode.training
+        query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, version, costly, lately)
         placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
         shading = self.config.outliers_in_shading and not mode.training
         return placed if shading else replace(placed, outlier=torch.zeros_like(placed.outlier))
@@ -386,9 +398,3 @@ SHELLS_KEPT = 512
 """Shells of training frames that are kept, of two or three megabytes each; the one made first is dropped."""
 _BETA_UNIT = 0.01
 """Metres; below about this the softplus bends, so the scale can shrink smoothly to millimetres."""
-
-
-def _normals(to_observation: Tensor, answer: FieldOutput) -> Tensor:
-    if answer.gradient is None:
-        raise ValueError("normals need the gradient of the distance; this field gave none")
-    return F.normalize((to_observation * answer.gradient[:, None]).sum(-1), dim=-1, eps=1e-6)

@@ -7,7 +7,7 @@ from twofold.field.factorized_grid import DETAILED
 ABSENT: dict[str, dict[str, object]] = {
     "method": {"late_neighbours": None, "late_from": 100, "normals_by": "posed", "background": "capture"},
     "method.sampler:ErrorBoundedSampler": {"units": "metres", "box": "posed"},
-    "method.sampler:ShellSampler": {"leap": 0.0, "finest": 0.0},
+    "method.sampler:ShellSampler": {"leap": 0.0, "finest": 0.0, "training_grid_every": 0},
     "method.field:GridFieldConfig": {
         "detail_voxels": [], "detail_parts": list(DETAILED), "finest_radius": None, "follow_images": False,
     },

@@ -17,6 +17,7 @@ from twofold.sampling.joint_box import RELEASED_MARGIN, joint_box
 from twofold.sampling.placement import Deformation, FieldQuery, Placement, placement
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.shell import Shell, build_shell
+from twofold.sampling.training_grid import TrainingGrid
 from twofold.volume.rendering import laplace_density
 from twofold.volume.samples import Samples
 
@@ -354,6 +355,7 @@ class ErrorBoundedPlacer:
 
     def __init__(self, config: ErrorBoundedSampler, deformation: Deformation) -> None:
         """Keeps the configuration."""
+        self.training_grid: TrainingGrid | None = None
         self.config, self.deformation = config, deformation
 
     def place(

@@ -10,7 +10,8 @@ from torch import Tensor
 from twofold.deform.skinning import map_to_canonical, weights_by, with_pose_gradient
 from twofold.geometry.cameras import Rays
 from twofold.sampling.posed_surface import PosedSurface
-from twofold.sampling.sdf_grid import Distance
+from twofold.sampling.sdf_grid import Distance, SdfGrid
+from twofold.sampling.training_grid import TrainingGrid
 from twofold.volume.samples import Samples
 
 
@@ -43,12 +44,14 @@ class FieldQuery:
         version: changes whenever the field's parameters do.
         costly: a query costs a third of what shading the sample does, or more: where a grid of distances has chosen the
             samples, they are not chosen once more by queries.
+        lately: distances as they were some training steps ago.
     """
 
     distance: Distance
     beta: Float[Tensor, ""]
     version: tuple[int, ...] = ()
     costly: bool = False
+    lately: SdfGrid | None = None
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,13 @@ def placement(
 
 
 class Sampler(Protocol):
-    """Places samples on rays. A sampler's configuration builds one."""
+    """Places samples on rays. A sampler's configuration builds one.
+
+    Attributes:
+        training_grid: what the avatar tabulates while it is trained, and stores; None where the sampler uses none.
+    """
+
+    training_grid: TrainingGrid | None
 
     def place(
         self, rays: Rays, surface: PosedSurface, query: FieldQuery, training: bool, generator: torch.Generator | None

@@ -17,6 +17,7 @@ from twofold.sampling.pruning import miswarped, visible
 from twofold.sampling.sdf_grid import SdfGrid, tabulate
 from twofold.sampling.shell import Shell, build_shell, expected_samples, nearest_listed, sample_shell
 from twofold.sampling.shell_walk import Walk, can_walk, parts_of_step, start_walk
+from twofold.sampling.training_grid import TrainingGrid
 from twofold.volume.samples import Samples
 
 _GRID_PAYS = 150_000
@@ -54,13 +55,16 @@ class ShellSampler:
     sdf_grid_voxel: float = 0.015
     """Rendering of large images: spacing of a grid of signed distances, queried once a pose, that finds most samples to
     be empty or hidden before the field is queried; metres, 0 queries the field for every sample."""
+    training_grid_every: int = 0
+    """While training on a CPU: steps after which such a grid is made anew, in the pose of another training frame each
+    time; 0 makes none."""
 
     def __post_init__(self) -> None:
         """Refuses sizes that leave nothing to sample."""
         # The voxels of a body fill half a gigabyte at the smallest edge; a ray crosses it in a thousand steps.
         require_within(
             self, radius=(0.005, 0.5), step=(0.001, 0.5), voxel=(0.005, 0.5), min_weight=(0, 1), miswarp_slack=(0, 0.5),
-            sdf_grid_voxel=(0, 0.5), leap=(0, 1), finest=(0, 0.5),
+            sdf_grid_voxel=(0, 0.5), leap=(0, 1), finest=(0, 0.5), training_grid_every=(0, 100_000),
         )  # fmt: skip
         if 0 < self.sdf_grid_voxel < 0.004:
             raise ValueError(f"sdf_grid_voxel={self.sdf_grid_voxel:g} should be 0.004 to 0.5, or 0 for no grid")
@@ -103,6 +107,8 @@ class ShellPlacer:
         self._canonical = canonical
         self._canonical_shell: Shell | None = None
         self._last_grid: tuple[PosedSurface, tuple[int, ...], SdfGrid] | None = None
+        every = config.training_grid_every if config.min_weight else 0
+        self.training_grid = TrainingGrid(canonical, config.radius, every) if every else None
 
     def place(
         self, rays: Rays, surface: PosedSurface, query: FieldQuery, training: bool, generator: torch.Generator | None
@@ -111,7 +117,7 @@ class ShellPlacer:
         least, shell = self.config.min_weight, self._shell(surface)
         if least == 0:
             return self.well_warped(rays, surface, generator)
-        grid = None if training else self._grid(shell, rays, surface, query)
+        grid = query.lately if training else self._grid(shell, rays, surface, query)
         if can_walk(shell, rays):
             walk = self._walk(shell, rays, surface, generator)
             return walk.seen(query, least, self.config.leap, self.config.finest, grid)
