@@ -97,7 +97,7 @@ PERIODS = {
     "training.decay_from", "training.images_per_step", "training.epochs", "training.checkpoint_every",
     "training.preview_every", "method.shell_refresh", "method.pose.zero_every", "method.pose.epochs",
     "method.skeletal.volume_every", "method.skeletal.guard_steps", "method.features_every", "method.sampler.step",
-    "method.prefit.steps",
+    "method.prefit.steps", "method.sampler.training_grid_every",
 }  # fmt: skip
 """Settings that are named like a schedule and are shares of it, how often something is repeated, or none."""
 

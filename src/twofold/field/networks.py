@@ -42,8 +42,8 @@ class NetworkConfig:
         radius: of that sphere, metres.
         hidden_dtype: type of the layers between the first and the last. With bfloat16 a signed distance is off by about
             a millimetre on average and a normal by some 1.5 degrees; "auto" takes it where the hardware is made for it.
-        exact_inputs: the first so many inputs are multiplied in the type of the points (positions); the others are
-            features of another network, multiplied in `hidden_dtype`. None: all are exact.
+        exact_inputs: number of leading inputs (positions, normals) that are multiplied in the type of the points; the
+            others are features of another network, multiplied in `hidden_dtype`. None: all are exact.
         native_softplus: torch's own softplus in place of the fast one.
     """
 
