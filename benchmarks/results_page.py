@@ -207,14 +207,21 @@ def _captures(captures: dict[str, Any]) -> str:
     return f"{_table(('What', 'Result', 'How'), rows)}\n{text[:1].upper()}{text[1:]}. {processor}.\n"
 
 
+FORMS = {
+    "quick": "`quick`", "quick_in_training": "`quick`, after 400 steps, 1,024 rays", "fast": "`fast`",
+    "reference": "reference form",
+}  # fmt: skip
+"""What the table of steps calls each measurement."""
+
+
 def _steps(results: dict[str, Any]) -> str:
     rows = [
         (
-            str(result["threads"]), f"`{name}`" if name != "reference" else "reference form", _s(part),
+            str(result["threads"]), form, _s(part),
             f"{part['rays_per_s']:,.0f}", f"{part['samples_per_ray']:.1f}", f"{part['peak_memory_gb']:.1f} GB",
             f"{result['reference']['median_s'] / part['median_s']:.0f}" if name == "fast" else "",
         )
-        for result in results.values() for name in ("quick", "fast", "reference") for part in [result[name]]
+        for result in results.values() for name, form in FORMS.items() if (part := result.get(name))
     ]  # fmt: skip
     return _table(("Threads", "Form", "Step", "Rays per second", "Samples per ray", "Memory", "Times faster"), rows)
 

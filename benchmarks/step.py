@@ -5,24 +5,32 @@ by automatic differentiation through automatic differentiation, float32. Ours sa
 and takes the gradients by a hand-written reverse pass. Both have the same networks, losses (without LPIPS) and 1,728
 rays.
 
+Recipe `quick` is timed within a training, too: there the density is sharp, most samples are hidden, and a grid of
+distances of some steps ago finds the others.
+
     python -m benchmarks.step [--threads 2] [--repeats 5] [--reference-repeats 1]
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import statistics
+import tempfile
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
 from benchmarks.common import peak_memory_gb, store, studio_capture, timed
 from twofold.kernels.runtime import tune_process
 from twofold.methods.base import Avatar, Mode
-from twofold.methods.factorized import FactorizedConfig
+from twofold.methods.factorized import FactorizedAvatar, FactorizedConfig
 from twofold.methods.factorized_recipes import fast, quick, released
 from twofold.methods.subject import Subject
 from twofold.recipe import Recipe
+from twofold.training.loop import train
 from twofold.training.pixels import PixelSource
 from twofold.training.row_adam import make_optimizer
 
@@ -85,6 +93,34 @@ def measure(recipe: Recipe, repeats: int, device: torch.device) -> dict[str, obj
     }
 
 
+def in_training(device: torch.device, steps: int = 600, last: int = 200) -> dict[str, object]:
+    """Seconds of a step of `quick`, with the rays of the recipe, at the end of a short training."""
+    capture, recipe, ended = studio_capture(512), quick(), list[float]()
+    training = replace(recipe.training, steps=steps, preview_every=0, checkpoint_every=steps)
+    recipe = replace(recipe, training=training)
+    with tempfile.TemporaryDirectory() as folder:
+        avatar = train(
+            capture, recipe, Path(folder) / "run", device, progress=lambda _: ended.append(time.perf_counter())
+        )
+    assert isinstance(avatar, FactorizedAvatar)
+    seconds = [end - begin for begin, end in itertools.pairwise(ended[-last - 1 : -1])]
+    rays = training.pixels.rays * training.images_per_step
+    source = PixelSource(capture.train, avatar.subject.body, avatar.subject.betas, training.pixels)
+    frame, generator, mode = capture.train[0], torch.Generator().manual_seed(1), Mode(steps)
+    batch = source.draw(0, generator, device)
+    posed = avatar.pose(frame.pose, frame.translation, frame.frame_index, mode)
+    median = statistics.median(seconds)
+    return {
+        "median_s": median,
+        "best_s": min(seconds),
+        "repeats": len(seconds),
+        "rays": rays,
+        "rays_per_s": rays / median,
+        "samples_per_ray": len(avatar.place(batch.rays, posed, mode, generator).samples) / len(batch.rays),
+        "peak_memory_gb": peak_memory_gb(),
+    }
+
+
 def main() -> None:
     """Measures and stores."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -98,6 +134,7 @@ def main() -> None:
     device = torch.device(arguments.device)
     result: dict[str, object] = {"what": "training step", "threads": arguments.threads, "device": str(device)}
     result["quick"] = measure(quick(), arguments.repeats, device)
+    result["quick_in_training"] = in_training(device)
     result["fast"] = ours = measure(fast(), arguments.repeats, device)
     result["reference"] = theirs = measure(reference(), arguments.reference_repeats, device)
     result["times_faster"] = float(theirs["median_s"]) / float(ours["median_s"])  # type: ignore[arg-type]
