@@ -200,62 +200,6 @@ def test_bf16_trains_through_the_pullback():
     assert sum(p.grad is not None and bool(p.grad.any()) for p in network.parameters()) >= 9
 
 
-FEATURES = NetworkConfig(
-    inputs=20, constants=2, outputs=21, depth=4, width=32, skip_layer=2, skip_columns=4, exact_inputs=4, head="tanh"
-)
-
-
-def with_features(hidden_dtype, **changes):
-    """One network with features in the type of hidden layers, with all columns exact, and all in single precision."""
-    config = replace(FEATURES, hidden_dtype=hidden_dtype, **changes)
-    network = config.build(torch.Generator().manual_seed(0))
-    plain = replace(config, exact_inputs=None).build()
-    exact = replace(config, hidden_dtype="float32").build()
-    constant = torch.tensor([0.3, -0.2])
-    for other in (plain, exact):
-        other.load_state_dict(network.state_dict())
-    ready = [other.at(constant) for other in (network, plain, exact)]
-    return *ready, torch.randn(200, 20, generator=torch.Generator().manual_seed(1))
-
-
-def test_features_are_exact_where_hidden_layers_are():
-    ready, plain, _, x = with_features("float32")
-    assert ready.features_in is None
-    assert torch.equal(ready(x), plain(x))
-
-
-@pytest.mark.parametrize("head", ["tanh", "linear"])
-@pytest.mark.parametrize(("first", "count"), [(0, 2), (0, 1), (2, 19), (1, 20), (0, 21), (5, 3)])
-def test_features_are_rounded_like_hidden_units(first, count, head):
-    ready, plain, exact, x = with_features("bfloat16", head=head)
-    assert ready.features_in.shape == (32, 16)
-    assert ready.matrices[0].shape == (32, 4)
-    assert ready.matrices[0].dtype == ready.matrices[-1].dtype == torch.float32
-    u = torch.randn(200, count, generator=torch.Generator().manual_seed(2))
-    answers, pulled = [], []
-    for network in (ready, plain, exact):
-        value, tape = network.forward_with_tape(x)
-        answers.append(value)
-        pulled.append(network.pullback(tape, u, first))
-    for (mine, other, right), columns in ((answers, 21), (pulled, 20)):
-        assert mine.shape == (200, columns)
-        assert mine.dtype == torch.float32
-        assert (mine - right).abs().mean() < 2 * (other - right).abs().mean() < 0.05 * right.abs().mean()
-        assert not torch.equal(mine, other)
-    torch.testing.assert_close(ready(x), answers[0])
-    torch.testing.assert_close(ready(x, 1), answers[0][:, :1])
-    torch.testing.assert_close(ready(x, 7), answers[0][:, :7])
-
-
-def test_training_reaches_the_weights_of_features():
-    x = torch.randn(50, 20, generator=torch.Generator().manual_seed(1))
-    network = replace(FEATURES, hidden_dtype="bfloat16").build(torch.Generator().manual_seed(0))
-    ready = network.at(torch.tensor([0.3, -0.2]))
-    value, tape = ready.forward_with_tape(x)
-    (value[:, 2:].square().mean() + ready.pullback(tape, torch.ones(50, 19), 2).square().mean()).backward()
-    assert (network.layers[0].direction.grad[:, 4:20].abs().amax(0) > 0).all()
-
-
 @pytest.mark.parametrize("fast", [True, False])
 def test_the_hardware_decides_about_bf16_where_it_is_asked(fast, monkeypatch):
     monkeypatch.setattr(networks, "bf16_is_fast", lambda device: fast)
@@ -279,7 +223,6 @@ def test_processor_flags_are_read_where_linux_lists_them(tmp_path):
         ({"skip_columns": 16}, ["skip_columns=16", "width=16"]),
         ({"skip_layer": 5}, ["skip_layer=5", "depth=5"]),
         ({"depth": 0}, ["depth"]),
-        ({"exact_inputs": 8}, ["exact_inputs=8", "skip_columns=9"]),
     ],
 )
 def test_clashing_sizes_are_refused(change, words):

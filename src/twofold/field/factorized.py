@@ -320,12 +320,10 @@ class FactorizedField(DenseField):
             start="sphere",
             radius=config.radius,
             hidden_dtype=config.hidden_dtype,
-            exact_inputs=columns,
             native_softplus=config.gradients == "autograd",
         )
-        exact = (3 if config.color_sees_position else 0) + 3
         color = NetworkConfig(
-            inputs=exact + config.width + (color_feature if handed else 0),
+            inputs=(3 if config.color_sees_position else 0) + 3 + config.width + (color_feature if handed else 0),
             outputs=3,
             depth=config.low_color_depth if is_low else config.high_color_depth,
             width=config.width,
@@ -333,7 +331,6 @@ class FactorizedField(DenseField):
             activation="relu",
             weight_norm=config.weight_norm,
             hidden_dtype=config.hidden_dtype,
-            exact_inputs=exact,
         )
         pose_code = config.pose_code if posed else None
         return BranchNetworks(sdf, color, pose_code, config.feature_code if handed else None, generator)

@@ -91,7 +91,6 @@ class ImplicitField(DenseField):
             activation="relu",
             start="torch",
             hidden_dtype=config.hidden_dtype,
-            exact_inputs=3 + 3,
         )
         self.networks = BranchNetworks(sdf, color, config.pose_code, None, generator)
 

@@ -42,8 +42,6 @@ class NetworkConfig:
         radius: of that sphere, metres.
         hidden_dtype: type of the layers between the first and the last. With bfloat16 a signed distance is off by about
             a millimetre on average and a normal by some 1.5 degrees; "auto" takes it where the hardware is made for it.
-        exact_inputs: number of leading inputs (positions, normals) that are multiplied in the type of the points; the
-            others are features of another network, multiplied in `hidden_dtype`. None: all are exact.
         native_softplus: torch's own softplus in place of the fast one.
     """
 
@@ -60,7 +58,6 @@ class NetworkConfig:
     start: Literal["sphere", "kaiming", "torch"] = "kaiming"
     radius: float = 0.6
     hidden_dtype: Precision = "float32"
-    exact_inputs: int | None = None
     native_softplus: bool = False
 
     def __post_init__(self) -> None:
@@ -69,8 +66,6 @@ class NetworkConfig:
             raise ValueError(f"depth should be at least 1, it is {self.depth}")
         if self.skip_layer is not None and not 0 < self.skip_layer < self.depth:
             raise ValueError(f"skip_layer={self.skip_layer} is no layer after the first of depth={self.depth}")
-        if self.exact_inputs is not None and self.exact_inputs < self.skip_columns:
-            raise ValueError(f"exact_inputs={self.exact_inputs} leave out some of skip_columns={self.skip_columns}")
         if self.skip_layer is not None and self.skip_columns >= self.width:
             raise ValueError(f"skip_columns={self.skip_columns} leave nothing of width={self.width}; widen the layers")
 
@@ -130,28 +125,28 @@ class ReadyNetwork:
 
     Attributes:
         config: of the network.
-        matrices: one a layer, [out in]; of the first one only what takes exact columns.
+        matrices: one a layer, [out in].
         biases: one a layer, [out]; the constant input is inside the first.
-        features_in: the rest of the first matrix, in the type of hidden layers; None where all inputs are exact.
     """
 
     config: NetworkConfig
     matrices: tuple[Tensor, ...]
     biases: tuple[Tensor, ...]
-    features_in: Float[Tensor, "w f"] | None = None
 
     def __call__(self, x: Float[Tensor, "S i"], outputs: int | None = None) -> Float[Tensor, "S o"]:
         """The answer, or its first columns alone."""
-        return self.head(self._hidden(x), outputs)
+        return self.head(self.hidden(x), outputs)
 
     def hidden(self, x: Float[Tensor, "S i"]) -> Float[Tensor, "S w"]:
         """Activations of the last hidden layer."""
-        return self._hidden(x).to(x.dtype)
+        h = x
+        for layer in range(self.config.depth):
+            h = self._activate(self._linear(h, x, layer))
+        return h.to(x.dtype)
 
     def head(self, hidden: Float[Tensor, "S w"], outputs: int | None = None) -> Float[Tensor, "S o"]:
         """The answer from the last hidden layer, or its first columns alone."""
-        matrix, bias = self.matrices[-1][:outputs], self.biases[-1][:outputs]
-        y = F.linear(hidden.to(matrix.dtype), matrix, bias)
+        y = F.linear(hidden, self.matrices[-1][:outputs], self.biases[-1][:outputs])
         return y.tanh() if self.config.head == "tanh" else y
 
     def forward_with_tape(self, x: Float[Tensor, "S i"]) -> tuple[Float[Tensor, "S o"], Tape]:
@@ -161,7 +156,7 @@ class ReadyNetwork:
         for layer in range(self.config.depth):
             h, slope = self._activate_with_slope(self._linear(h, x, layer))
             slopes.append(slope)
-        y = self.head(h)
+        y = self.head(h.to(x.dtype))
         return y, Tape(tuple(slopes), y if self.config.head == "tanh" else None)
 
     def pullback(self, tape: Tape, cotangent: Float[Tensor, "S k"], first: int = 0) -> Float[Tensor, "S i"]:
@@ -188,33 +183,18 @@ class ReadyNetwork:
         if tape.outputs is not None:
             u = u * (1 - tape.outputs[:, rows].square())
         u = u @ self.matrices[-1][rows]
-        for layer in reversed(range(1, self.config.depth)):
+        for layer in reversed(range(self.config.depth)):
             matrix, slope = self.matrices[layer], tape.slopes[layer]
             u = (u.to(slope.dtype) * slope).to(matrix.dtype) @ matrix
             if layer == self.config.skip_layer:
                 k = self.config.skip_columns
                 u, again = u[:, :-k], u[:, -k:].to(cotangent.dtype)
-        slope = tape.slopes[0]
-        u = u.to(slope.dtype) * slope
-        by_input = u.to(self.matrices[0].dtype) @ self.matrices[0]
         if again is not None:
-            by_input = by_input + F.pad(again, (0, by_input.shape[-1] - again.shape[-1]))
-        if self.features_in is None:
-            return by_input
-        return torch.cat([by_input, (u.to(self.features_in.dtype) @ self.features_in).to(by_input.dtype)], -1)
-
-    def _hidden(self, x: Tensor) -> Tensor:
-        h = x
-        for layer in range(self.config.depth):
-            h = self._activate(self._linear(h, x, layer))
-        return h
+            u = u + F.pad(again, (0, u.shape[-1] - again.shape[-1]))
+        return u
 
     def _linear(self, h: Tensor, x: Tensor, layer: int) -> Tensor:
         matrix, bias = self.matrices[layer], self.biases[layer]
-        if layer == 0 and self.features_in is not None:
-            exact = matrix.shape[1]
-            by_features = F.linear(x[:, exact:].to(self.features_in.dtype), self.features_in)
-            return F.linear(x[:, :exact], matrix, bias) + by_features
         if layer == self.config.skip_layer:
             h = torch.cat([h.to(matrix.dtype), x[:, : self.config.skip_columns].to(matrix.dtype)], -1)
         return F.linear(h.to(matrix.dtype), matrix, bias)
@@ -259,16 +239,11 @@ class Network(nn.Module):
             matrices[0] = matrices[0][:, : config.inputs]
         if config.skip_layer is not None:
             matrices[config.skip_layer] = matrices[config.skip_layer] * math.sqrt(0.5)
-        if config.hidden_dtype == "float32" or (config.hidden_dtype == "auto" and not bf16_is_fast(matrices[0].device)):
-            return ReadyNetwork(config, tuple(matrices), tuple(biases))
-        rounded = torch.bfloat16
-        for layer in range(1, config.depth):
-            matrices[layer], biases[layer] = matrices[layer].to(rounded), biases[layer].to(rounded)
-        features_in, columns = None, config.exact_inputs
-        if columns is not None and columns < config.inputs:
-            features_in = matrices[0][:, columns:].to(rounded)
-            matrices[0] = matrices[0][:, :columns]
-        return ReadyNetwork(config, tuple(matrices), tuple(biases), features_in)
+        if config.hidden_dtype == "bfloat16" or (config.hidden_dtype == "auto" and bf16_is_fast(matrices[0].device)):
+            for layer in range(1, config.depth):
+                matrices[layer] = matrices[layer].to(torch.bfloat16)
+                biases[layer] = biases[layer].to(torch.bfloat16)
+        return ReadyNetwork(config, tuple(matrices), tuple(biases))
 
     def _layers(self) -> list[Layer]:
         return [layer for layer in self.layers if isinstance(layer, Layer)]
