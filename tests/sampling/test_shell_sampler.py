@@ -1,4 +1,4 @@
-"""An SDF grid changes which samples the networks are queried for, and no rendering."""
+"""An SDF grid saves queries of the field, and images stay as they are."""
 
 from dataclasses import replace
 
@@ -50,6 +50,18 @@ def looking(dense, person, monkeypatch):
 
     yield look
     dense._sampler.config = config
+
+
+def test_images_are_the_same_with_a_table(looking, dense, monkeypatch):
+    monkeypatch.setattr(dense.field, "dense", False)  # Queries count as cheap: the field has the last word.
+    (plain, many, _), (tabled, _, posed) = looking(0.0), looking(0.015)
+    assert 0.1 < plain.opacity.mean() < 0.9
+    for name in ("color", "opacity", "depth", "normal"):
+        torch.testing.assert_close(getattr(tabled, name), getattr(plain, name), atol=4e-3, rtol=0)
+    # With the table made already, fewer samples are left to ask about.
+    again, few, _ = looking(0.015, posed)
+    assert torch.equal(again.color, tabled.color)
+    assert 0 < few < 0.8 * many
 
 
 def test_a_table_alone_chooses_samples_as_well_as_queries_do(looking):

@@ -107,7 +107,7 @@ def test_training_finds_nearly_the_samples_that_queries_find(avatar, person):
         query = FieldQuery(avatar.field.sdf_at(posed.own.condition), avatar.beta)
         exact, found = (
             avatar._sampler.place(rays, posed.own.surface, each, True, torch.Generator().manual_seed(0))
-            for each in (query, replace(query, lately=grid))
+            for each in (query, replace(query, recent_grid=grid))
         )
     keys = [
         set(zip(placed.samples.ray_index.tolist(), placed.samples.depth.tolist(), strict=True))

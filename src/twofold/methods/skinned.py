@@ -310,9 +310,9 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
     def place(self, rays: Rays, posed: Posed, mode: Mode, generator: torch.Generator | None) -> Placement:
         """The samples that `render` shades."""
         version = (self._steps, *(parameter._version for parameter in self.field.parameters()))
-        lately = self.training_grid.grid() if mode.training and self.training_grid is not None else None
+        recent_grid = self.training_grid.grid() if mode.training and self.training_grid is not None else None
         costly = self.field.dense and not mode.training
-        query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, version, costly, lately)
+        query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, version, costly, recent_grid)
         placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
         shading = self.config.outliers_in_shading and not mode.training
         return placed if shading else replace(placed, outlier=torch.zeros_like(placed.outlier))

@@ -44,14 +44,14 @@ class FieldQuery:
         version: changes whenever the field's parameters do.
         costly: a query costs a third of what shading the sample does, or more: where a grid of distances has chosen the
             samples, they are not chosen once more by queries.
-        lately: distances as they were some training steps ago.
+        recent_grid: distances as they were some training steps ago.
     """
 
     distance: Distance
     beta: Float[Tensor, ""]
     version: tuple[int, ...] = ()
     costly: bool = False
-    lately: SdfGrid | None = None
+    recent_grid: SdfGrid | None = None
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,7 @@ class ShellPlacer:
         least, shell = self.config.min_weight, self._shell(surface)
         if least == 0:
             return self.well_warped(rays, surface, generator)
-        grid = query.lately if training else self._grid(shell, rays, surface, query)
+        grid = query.recent_grid if training else self._grid(shell, rays, surface, query)
         if can_walk(shell, rays):
             walk = self._walk(shell, rays, surface, generator)
             return walk.seen(query, least, self.config.leap, self.config.finest, grid)
