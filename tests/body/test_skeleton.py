@@ -258,7 +258,89 @@ def test_rotation_matrices_pose_the_joints_as_their_axis_angles_do():
     joints, pose = torch.rand(24, 3, generator=generator), torch.randn(24, 3, generator=generator)
     translation = torch.rand(3, generator=generator)
     matrices = joint_transforms_of_rotations(joints, axis_angle_to_matrix(pose), translation)
-    assert torch.equal(matrices, joint_transforms(joints, pose, translation))
+    torch.testing.assert_close(matrices, joint_transforms(joints, pose, translation), atol=2e-6, rtol=0)
+
+
+def with_gradients(function, inputs, by_result):
+    """What a function gives and its gradients, those of inputs that it is constant in included."""
+    inputs = [x.detach().requires_grad_() for x in inputs]
+    result = function(*inputs)
+    return result.detach(), torch.autograd.grad(result, inputs, by_result.to(result.dtype))
+
+
+def draw_inputs(batch, size, seed):
+    generator = torch.Generator().manual_seed(seed)
+    shapes = ((24, 3), (*batch, 24, 3), (*batch, 3), (*batch, 24, 4, 4))
+    joints, pose, translation, by_result = (torch.randn(shape, generator=generator) for shape in shapes)
+    return (joints, size * pose, translation), by_result
+
+
+@pytest.mark.parametrize("form", [joint_transforms, joint_transforms_of_rotations])
+@pytest.mark.parametrize("size", [0, 1e-5, 6e-5, 1e-3, 0.1, 1.0, 4.0, 30.0])
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3), (0,)])
+def test_compiled_kinematics_are_the_plain_ones_in_double_precision(form, batch, size):
+    """Sizes lie below, around and above the angle of 1e-4 where the series for small angles ends."""
+    inputs, by_result = draw_inputs(batch, size, seed=7)
+    if form is joint_transforms_of_rotations:
+        # Corrected rotations need not be orthonormal.
+        turns = axis_angle_to_matrix(inputs[1])
+        inputs = (inputs[0], turns + 0.1 * torch.sin(5 * turns), inputs[2])
+    found, gradients = with_gradients(form, inputs, by_result)
+    expected, true_gradients = with_gradients(form, [x.double() for x in inputs], by_result)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.double(), expected, atol=5e-6, rtol=1e-6)
+    for one, true in zip(gradients, true_gradients, strict=True):
+        scale = float(true.abs().max()) if true.numel() else 0.0
+        torch.testing.assert_close(one.double(), true, atol=1e-6 * scale + 3e-6, rtol=0)
+
+
+@settings(max_examples=20)
+@given(seeds, st.floats(-6, 1))
+def test_compiled_kinematics_have_the_gradient_of_the_plain_ones_for_any_pose(seed, power):
+    inputs, by_result = draw_inputs((2,), 10.0**power, seed)
+    _, gradients = with_gradients(joint_transforms, inputs, by_result)
+    _, expected = with_gradients(joint_transforms, [x.double() for x in inputs], by_result)
+    for one, true in zip(gradients, expected, strict=True):
+        torch.testing.assert_close(one.double(), true, atol=1e-6 * float(true.abs().max()) + 3e-6, rtol=0)
+
+
+@pytest.mark.parametrize("wanted", [(True, False, False), (False, True, False), (False, False, True)])
+def test_a_single_gradient_is_that_among_all(wanted):
+    inputs, by_result = draw_inputs((2,), 1.0, seed=8)
+    _, every = with_gradients(joint_transforms, inputs, by_result)
+    alone = [x.detach().requires_grad_(one) for x, one in zip(inputs, wanted, strict=True)]
+    joint_transforms(*alone).backward(by_result)
+    for x, gradient, one in zip(alone, every, wanted, strict=True):
+        assert (x.grad is not None) == one
+        assert not one or torch.equal(x.grad, gradient)
+
+
+def test_compiled_kinematics_take_expanded_and_transposed_tensors():
+    (joints, pose, translation), by_result = draw_inputs((24,), 1.0, seed=9)
+    strided = (
+        joints.T.contiguous().T,
+        pose.transpose(0, 1).contiguous().transpose(0, 1),
+        translation[:1].expand(24, 3),
+    )
+    assert not any(x.is_contiguous() for x in strided)
+    by_strided = by_result.mT.contiguous().mT
+    plain = (joints, pose, translation[:1].repeat(24, 1))
+    found, expected = (
+        with_gradients(joint_transforms, strided, by_strided),
+        with_gradients(joint_transforms, plain, by_result),
+    )
+    assert torch.equal(found[0], expected[0])
+    for one, other in zip(found[1], expected[1], strict=True):
+        assert torch.equal(one, other)
+
+
+def test_kinematics_work_within_functional_transforms():
+    (joints, pose, translation), _ = draw_inputs((3,), 1.0, seed=10)
+    each = torch.vmap(joint_transforms, in_dims=(None, 0, 0))(joints, pose, translation)
+    torch.testing.assert_close(each, joint_transforms(joints, pose, translation), atol=5e-6, rtol=0)
+    by_pose = torch.func.jacrev(joint_transforms, 1)(joints, pose[0], translation[0])
+    alone = torch.autograd.functional.jacobian(lambda p: joint_transforms(joints, p, translation[0]), pose[0])
+    torch.testing.assert_close(by_pose, alone, atol=5e-6, rtol=0)
 
 
 def test_movement_is_the_largest_way_of_a_vertex():

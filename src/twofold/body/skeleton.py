@@ -8,12 +8,15 @@ one it was.
 import itertools
 import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from twofold.body import kinematics_kernels as kernels
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigid_transform
 from twofold.npz import are_moderate
@@ -25,6 +28,7 @@ JOINT_NAMES = (
 )  # fmt: skip
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 """SMPL's tree; a parent always comes before its children, and the root's parent is -1."""
+_PARENTS = np.array(PARENTS)
 
 _GENERATIONS = (1, 4, 7, 10, 15, 18, 20, 22, 24)
 """Joints equally far from the root stand together in SMPL's order; here each such group begins (and the last ends)."""
@@ -207,7 +211,11 @@ def joint_transforms(
 
     The root turns about its own rest joint and `translation` is added afterwards, SMPL's own convention. The result
     acts on points of the T-pose (it is already relative to the rest joints).
+
+    In single precision on a CPU it is one compiled loop, differentiable once; elsewhere many operations.
     """
+    if _compiled(joints, pose, translation):
+        return _Kinematics.apply(joints, pose, translation)  # type: ignore[return-value]
     return joint_transforms_of_rotations(joints, axis_angle_to_matrix(pose), translation)
 
 
@@ -215,6 +223,8 @@ def joint_transforms_of_rotations(
     joints: Float[Tensor, "24 3"], rotations: Float[Tensor, "*b 24 3 3"], translation: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 24 4 4"]:
     """`joint_transforms` of a pose given as rotation matrices, root first."""
+    if _compiled(joints, rotations, translation):
+        return _Kinematics.apply(joints, rotations, translation)  # type: ignore[return-value]
     rest = joints.unbind()
     above = torch.stack([rest[parent] for parent in PARENTS[1:]])
     offsets = (joints[1:] - above).expand(*translation.shape[:-1], 23, 3)
@@ -227,6 +237,47 @@ def joint_transforms_of_rotations(
     world = torch.stack(chain, -3)
     moved = (world[..., :3, :3] @ joints[:, :, None])[..., 0]
     return rigid_transform(world[..., :3, :3], world[..., :3, 3] - moved)
+
+
+def _compiled(*tensors: Tensor) -> bool:
+    """Whether the compiled form can be used: single precision on a CPU, and nothing like `torch.vmap` around it."""
+    if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():  # pyright: ignore[reportPrivateUsage]
+        return False
+    return all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
+
+
+class _Kinematics(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, joints: Tensor, turns: Tensor, translation: Tensor) -> Tensor:  # type: ignore[override]
+        """Transforms [*b 24 4 4] from axis-angle vectors [*b 24 3] or rotation matrices [*b 24 3 3]."""
+        joints, turns, translation = (t.detach().contiguous() for t in (joints, turns, translation))
+        matrices, placed = turns, torch.empty(*translation.shape[:-1], 24, 4, 4)
+        if turns.ndim == translation.ndim + 1:
+            matrices = torch.empty(*turns.shape, 3)
+            kernels.rotations(turns.numpy().reshape(-1, 3), matrices.numpy().reshape(-1, 3, 3))
+        given = (matrices.numpy().reshape(-1, 24, 3, 3), translation.numpy().reshape(-1, 3))
+        kernels.transforms(joints.numpy(), *given, _PARENTS, placed.numpy().reshape(-1, 24, 4, 4))
+        ctx.save_for_backward(joints, turns, matrices, placed)
+        return placed
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_placed: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        wanted, tensors = ctx.needs_input_grad, (*ctx.saved_tensors, by_placed.contiguous())
+        joints, turns, matrices, placed, given = (tensor.detach().numpy() for tensor in tensors)
+        bodies = placed.reshape(-1, 24, 4, 4)
+        by_joints, by_translation = np.empty_like(joints), np.empty((len(bodies), 3), np.float32)
+        by_turns = np.empty((len(bodies) if wanted[1] else 0, 24, 3, 3), np.float32)
+        kernels.transforms_backward(
+            joints, matrices.reshape(-1, 24, 3, 3), _PARENTS, bodies, given.reshape(-1, 24, 4, 4), wanted,
+            by_joints, by_turns, by_translation,
+        )  # fmt: skip
+        if wanted[1] and turns.ndim < matrices.ndim:
+            by_matrices, by_turns = by_turns, np.empty_like(turns)
+            kernels.rotations_backward(turns.reshape(-1, 3), by_matrices.reshape(-1, 3, 3), by_turns.reshape(-1, 3))
+        by_turns = by_turns.reshape(turns.shape) if wanted[1] else by_turns
+        found = (by_joints, by_turns, by_translation.reshape(*placed.shape[:-3], 3))
+        return tuple(torch.from_numpy(array) if one else None for array, one in zip(found, wanted, strict=True))
 
 
 def blend_shapes(shaped: ShapedBody, pose: Float[Tensor, "24 3"]) -> Float[Tensor, "V 3"]:
