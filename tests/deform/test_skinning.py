@@ -227,6 +227,49 @@ def test_mapping_once_has_the_values_and_the_pose_gradient_of_mapping_again(k):
     assert not plain[0].requires_grad
 
 
+def pose_gradient_case(k, seed=4, samples=400, vertices=37):
+    """Samples with neighbours that share vertices, as in training, and cotangents of both results; single precision."""
+    generator = torch.Generator().manual_seed(seed)
+    forward = torch.eye(3, 4) + 0.2 * torch.randn(vertices, 3, 4, generator=generator)
+    nearest = torch.randint(vertices - 1, (samples, k), generator=generator)  # the last one is nobody's
+    weights = torch.rand(samples, k, generator=generator)
+    weights = weights / weights.sum(1, keepdim=True)
+    x, by_x = torch.randn(2, samples, 3, generator=generator)
+    x_canonical, inverse = map_to_canonical(x, nearest, weights, forward)
+    by_turn = torch.randn(samples, 3, 3, generator=generator)
+    return (x_canonical, inverse, nearest, weights, forward), (by_x, by_turn)
+
+
+@pytest.mark.parametrize("k", [1, 6])
+@pytest.mark.parametrize("used", [(True, True), (True, False), (False, True)])
+def test_compiled_pose_gradient_is_its_twin_in_double_precision(k, used):
+    given, cotangents = pose_gradient_case(k)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        *fixed, forward = (t.to(dtype) if t.is_floating_point() else t for t in given)
+        forward = forward.requires_grad_()
+        results = with_pose_gradient(*fixed, forward)
+        assert all(result.is_contiguous() and result.dtype == dtype for result in results)
+        chosen = [r for r, one in zip(results, used, strict=True) if one]
+        by_chosen = [c.to(dtype) for c, one in zip(cotangents, used, strict=True) if one]
+        (gradient,) = torch.autograd.grad(chosen, forward, by_chosen)
+        assert (gradient[-1] == 0).all()
+        found.append((*(r.detach().double() for r in results), gradient.double()))
+    single, double = found
+    torch.testing.assert_close(single[:2], double[:2], atol=0, rtol=0)
+    torch.testing.assert_close(single[2], double[2], atol=2e-6 * float(double[2].abs().max()), rtol=1e-4)
+
+
+def test_compiled_pose_gradient_repeats_to_the_bit_and_takes_strided_tensors():
+    given, (by_x, by_turn) = pose_gradient_case(6)
+    forward = given[-1].requires_grad_()
+    strided = [t.mT.contiguous().mT for t in given[:4]]
+    assert not any(t.is_contiguous() for t in strided)
+    first = torch.autograd.grad(with_pose_gradient(*given), forward, (by_x, by_turn))[0]
+    again = torch.autograd.grad(with_pose_gradient(*strided, forward), forward, (by_x, by_turn.mT.contiguous().mT))[0]
+    assert torch.equal(first, again)
+
+
 @pytest.mark.parametrize("k", [1, 6])
 def test_compiled_form_is_its_twin_in_double_precision(body, k):
     points = near_the_body(body, 500).float()

@@ -193,11 +193,20 @@ class _WithPoseGradient(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         ctx.save_for_backward(x_canonical, inverse, nearest, weights)
         ctx.vertices = forward.shape[0]
+        if _compiled(inverse):
+            transposed = torch.empty(len(inverse), 3, 3)
+            kernels.transposed_linear(inverse.contiguous().numpy(), transposed.numpy())
+            return x_canonical.clone(), transposed
         return x_canonical.clone(), inverse[..., :3].transpose(-1, -2).contiguous()
 
     @staticmethod
     def backward(ctx: Any, by_x: Tensor, by_transposed: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         x_canonical, inverse, nearest, weights = ctx.saved_tensors
+        given = (x_canonical, inverse, nearest, weights, by_x, by_transposed)
+        if _compiled(x_canonical, inverse, weights, by_x, by_transposed):
+            out = torch.zeros(ctx.vertices, 3, 4)
+            kernels.map_points_backward(*(tensor.contiguous().numpy() for tensor in given), out.numpy())
+            return out, None, None, None, None
         transposed = inverse[..., :3].transpose(-1, -2)
         # x_c = R^-1 (x_o - t):  d/dR = -(R^-T g) x_c^T,  d/dt = -R^-T g.
         pulled = (transposed * by_x[:, None, :]).sum(-1)

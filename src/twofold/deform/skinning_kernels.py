@@ -1,4 +1,4 @@
-"""Compiled loops of inverse skinning, for CPUs; `skinning` holds the same in PyTorch, which has gradients."""
+"""Compiled loops of inverse skinning and its reverse pass, for CPUs; `skinning` holds the same in PyTorch."""
 
 # pyright: reportMissingParameterType=false
 
@@ -47,3 +47,48 @@ def map_points(x, nearest, weights, forward, x_canonical, inverse, begin, end): 
                 out[i, j] /= determinant
             out[i, 3] = -(out[i, 0] * a[3] + out[i, 1] * b[3] + out[i, 2] * c[3])
             x_canonical[s, i] = out[i, 0] * x[s, 0] + out[i, 1] * x[s, 1] + out[i, 2] * x[s, 2] + out[i, 3]
+
+
+@compiled
+def transposed_linear(inverse, out):  # noqa: ANN001, ANN201
+    """out[S 3 3] = transposed linear parts of transforms [S 3 4]."""
+    for s in range(inverse.shape[0]):
+        for i in range(3):
+            for j in range(3):
+                out[s, i, j] = inverse[s, j, i]
+
+
+@compiled
+def map_points_backward(x_canonical, inverse, nearest, weights, by_x, by_transposed, out):  # noqa: ANN001, ANN201
+    r"""Adds to out[V 3 4] the cotangent of the vertices' transforms, of samples in their order: `with_pose_gradient`.
+
+    With the blended transform (A | t) of a sample, the gradients g by x_c and G by A^-1,
+
+    \[ \bar t = -A^{-\top} g, \qquad \bar A = \bar t \, x_c^\top - A^{-\top} G A^{-\top}, \qquad
+    \bar F_{v_k} \mathrel{+}= \omega_k (\bar A \mid \bar t) \]
+
+    Args:
+        x_canonical: x_c [S 3], metres.
+        inverse: (A | t)^-1 [S 3 4].
+        nearest: v, the K vertices of each sample [S K].
+        weights: omega [S K].
+        by_x: g [S 3].
+        by_transposed: G transposed [S 3 3].
+        out: zero, or what these are added to.
+    """
+    mixed, half = np.empty((3, 4), np.float32), np.empty((3, 3), np.float32)
+    for s in range(nearest.shape[0]):
+        a, g = inverse[s], by_transposed[s]
+        for i in range(3):
+            mixed[i, 3] = -(a[0, i] * by_x[s, 0] + a[1, i] * by_x[s, 1] + a[2, i] * by_x[s, 2])
+            for k in range(3):
+                half[i, k] = a[0, i] * g[k, 0] + a[1, i] * g[k, 1] + a[2, i] * g[k, 2]
+        for i in range(3):
+            for j in range(3):
+                turned = half[i, 0] * a[j, 0] + half[i, 1] * a[j, 1] + half[i, 2] * a[j, 2]
+                mixed[i, j] = mixed[i, 3] * x_canonical[s, j] - turned
+        for k in range(nearest.shape[1]):
+            vertex, weight = nearest[s, k], weights[s, k]
+            for i in range(3):
+                for j in range(4):
+                    out[vertex, i, j] += weight * mixed[i, j]
