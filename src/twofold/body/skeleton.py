@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from twofold.body import kinematics_kernels as kernels
+from twofold.body.blending import can_compile, move_points, skin_vertices
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigid_transform
 from twofold.npz import are_moderate
@@ -214,7 +215,7 @@ def joint_transforms(
 
     In single precision on a CPU it is one compiled loop, differentiable once; elsewhere many operations.
     """
-    if _compiled(joints, pose, translation):
+    if can_compile(joints, pose, translation):
         return _Kinematics.apply(joints, pose, translation)  # type: ignore[return-value]
     return joint_transforms_of_rotations(joints, axis_angle_to_matrix(pose), translation)
 
@@ -223,7 +224,7 @@ def joint_transforms_of_rotations(
     joints: Float[Tensor, "24 3"], rotations: Float[Tensor, "*b 24 3 3"], translation: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 24 4 4"]:
     """`joint_transforms` of a pose given as rotation matrices, root first."""
-    if _compiled(joints, rotations, translation):
+    if can_compile(joints, rotations, translation):
         return _Kinematics.apply(joints, rotations, translation)  # type: ignore[return-value]
     rest = joints.unbind()
     above = torch.stack([rest[parent] for parent in PARENTS[1:]])
@@ -237,13 +238,6 @@ def joint_transforms_of_rotations(
     world = torch.stack(chain, -3)
     moved = (world[..., :3, :3] @ joints[:, :, None])[..., 0]
     return rigid_transform(world[..., :3, :3], world[..., :3, 3] - moved)
-
-
-def _compiled(*tensors: Tensor) -> bool:
-    """Whether the compiled form can be used: single precision on a CPU, and nothing like `torch.vmap` around it."""
-    if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():  # pyright: ignore[reportPrivateUsage]
-        return False
-    return all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
 
 
 class _Kinematics(torch.autograd.Function):
@@ -293,8 +287,7 @@ def skin(
     points: Float[Tensor, "n 3"], weights: Float[Tensor, "n J"], transforms: Float[Tensor, "J 4 4"]
 ) -> Float[Tensor, "n 3"]:
     """Linear blend skinning: each point moved by the weighted mean of the transforms."""
-    blended = (weights @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4))
-    return (blended[:, :, :3] @ points[:, :, None])[..., 0] + blended[:, :, 3]
+    return move_points(points, (weights @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4)))
 
 
 def pose_body(
@@ -320,8 +313,8 @@ def pose_body(
     to_world = joint_transforms(shaped.joints, pose, translation)
     posed_joints = (to_world[:, :3, :3] @ shaped.joints[:, :, None])[..., 0] + to_world[:, :3, 3]
     return PosedBody(
-        vertices=skin(blend_shapes(shaped, pose), shaped.weights, to_world),
-        canonical_vertices=skin(blend_shapes(shaped, rest_pose), shaped.weights, to_canonical),
+        vertices=skin_vertices(blend_shapes(shaped, pose), shaped.weights, to_world),
+        canonical_vertices=skin_vertices(blend_shapes(shaped, rest_pose), shaped.weights, to_canonical),
         faces=shaped.faces,
         weights=shaped.weights,
         bones=to_world @ rigid_inverse(from_canonical),

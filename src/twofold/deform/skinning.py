@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from twofold.body.blending import blend_transforms
 from twofold.body.skeleton import PosedBody
 from twofold.deform import skinning_kernels as kernels
 from twofold.kernels.parallel import in_parts
@@ -65,7 +66,7 @@ def vertex_transforms(body: PosedBody) -> Float[Tensor, "V 3 4"]:
     >>> vertex_transforms(body)[0, :, 3]  # half of the way
     tensor([1., 0., 0.])
     """
-    return (body.weights @ body.bones[:, :3].flatten(1)).unflatten(-1, (3, 4))
+    return blend_transforms(body.weights, body.bones)
 
 
 def neighbour_weights(squared_distances: Float[Tensor, "S K"]) -> Float[Tensor, "S K"]:
