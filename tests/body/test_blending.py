@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twofold.body.blending import blend_transforms, skin_vertices
+from twofold.body.blending import blend_transforms, has_kernel, skin_vertices
 from twofold.body.skeleton import skin
 
 
@@ -64,7 +64,6 @@ def test_both_are_the_dense_product_for_any_body(points, joints, seed):
     inputs = draw(points, joints, seed)
     require_alike(skin_vertices, inputs, (True, False, True), seed)
     require_alike(blend_transforms, inputs[1:], (False, True), seed)
-    torch.testing.assert_close(skin_vertices(*inputs), skin(*inputs), atol=5e-6, rtol=1e-5)
 
 
 def test_the_last_row_of_a_transform_has_no_gradient():
@@ -80,12 +79,34 @@ def test_strided_tensors_are_taken_as_contiguous_ones():
     inputs = draw()
     strided = [x.T.contiguous().T if x.ndim == 2 else x.mT.contiguous().mT for x in inputs]
     assert not any(x.is_contiguous() for x in strided)
-    assert torch.equal(skin_vertices(*strided), skin_vertices(*inputs))
-    assert torch.equal(blend_transforms(*strided[1:]), blend_transforms(*inputs[1:]))
+    for form, first in ((skin_vertices, 0), (blend_transforms, 1)):
+        wanted = [gradients_of(form, (*given[first:-1], given[-1].requires_grad_()), 3) for given in (inputs, strided)]
+        for one, other in zip(*wanted, strict=True):
+            assert torch.equal(one, other)
+
+
+def test_loops_are_for_gradients_in_single_precision():
+    points, _, transforms = draw()
+    learned = transforms.clone().requires_grad_()
+    assert has_kernel(points, learned)
+    assert not has_kernel(points, transforms)
+    assert not has_kernel(points.double(), learned)
+    with torch.no_grad():
+        assert not has_kernel(points, learned)
+
+
+def test_without_a_gradient_results_are_those_of_the_dense_product_to_the_bit():
+    """Stored feature grids lie around the canonical body; see `has_kernel`."""
+    points, weights, transforms = draw()
+    dense = (weights @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4))
+    assert torch.equal(blend_transforms(weights, transforms), dense)
+    moved = (dense[:, :, :3] @ points[:, :, None])[..., 0] + dense[:, :, 3]
+    assert torch.equal(skin_vertices(points, weights, transforms), moved)
 
 
 def test_weights_that_were_changed_are_looked_at_again():
     points, weights, transforms = draw()
+    transforms.requires_grad_()
     before = skin_vertices(points, weights, transforms)
     assert torch.equal(skin_vertices(points, weights, transforms), before)
     weights.copy_(few_weights(50, 24, seed=5))
@@ -95,17 +116,21 @@ def test_weights_that_were_changed_are_looked_at_again():
 
 
 def test_weights_of_inference_mode_are_looked_at_each_time():
+    points, _, transforms = draw()
+    transforms.requires_grad_()
     with torch.inference_mode():
-        points, weights, transforms = draw()
-        for seed in (1, 2):
-            weights.copy_(few_weights(50, 24, seed))
-            expected = skin(points, weights, transforms)
-            torch.testing.assert_close(skin_vertices(points, weights, transforms), expected, atol=5e-6, rtol=1e-5)
+        weights = few_weights(50, 24, seed=1)
+    for seed in (1, 2):
+        other = few_weights(50, 24, seed)
+        with torch.inference_mode():
+            weights.copy_(other)
+        expected = skin(points, other, transforms)
+        torch.testing.assert_close(skin_vertices(points, weights, transforms), expected, atol=5e-6, rtol=1e-5)
 
 
 def test_both_work_within_functional_transforms():
     points, weights, transforms = draw()
-    many = torch.stack([transforms, 2 * transforms])
+    many = torch.stack([transforms, 2 * transforms]).requires_grad_()
     for n, result in enumerate(torch.vmap(skin_vertices, in_dims=(None, None, 0))(points, weights, many)):
         torch.testing.assert_close(result, skin_vertices(points, weights, many[n]), atol=5e-6, rtol=1e-5)
     by_transforms = torch.func.jacrev(blend_transforms, 1)(weights, transforms)

@@ -16,17 +16,22 @@ _known: "WeakTensorKeyDictionary" = WeakTensorKeyDictionary()
 """The entries of weights that are in use, and which version of these they are of: a body has the same in every step."""
 
 
-def can_compile(*tensors: Tensor) -> bool:
-    """Whether compiled loops can be used: single precision on a CPU, and nothing like `torch.vmap` around them."""
+def has_kernel(*tensors: Tensor) -> bool:
+    """Whether compiled loops are used: for a gradient in single precision on a CPU, with nothing like `torch.vmap`.
+
+    Without a gradient it stays with PyTorch, to the bit: feature grids are built around a body in the canonical pose,
+    and stored features belong to rows that another rounding would change.
+    """
     if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():  # pyright: ignore[reportPrivateUsage]
         return False
-    return all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
+    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    return wanted and all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
 
 
 def blend_transforms(weights: Float[Tensor, "n J"], transforms: Float[Tensor, "J 4 4"]) -> Float[Tensor, "n 3 4"]:
     r"""The upper three rows of the weighted mean of transforms, $\sum_j w_{vj} B_j$.
 
-    Weights that do not learn have compiled loops in single precision on a CPU, differentiable once.
+    Differentiable once where `has_kernel` says so and the weights do not learn, else as often as one likes.
 
     >>> shifts = torch.eye(4).repeat(2, 1, 1)
     >>> shifts[1, 0, 3] = 2.0
@@ -37,7 +42,7 @@ def blend_transforms(weights: Float[Tensor, "n J"], transforms: Float[Tensor, "J
         weights: rows sum to 1.
         transforms: affine.
     """
-    if can_compile(weights, transforms) and not weights.requires_grad:
+    if has_kernel(weights, transforms) and not weights.requires_grad:
         return _Blend.apply(weights, transforms)  # type: ignore[return-value]
     return (weights @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4))
 
@@ -45,8 +50,8 @@ def blend_transforms(weights: Float[Tensor, "n J"], transforms: Float[Tensor, "J
 def skin_vertices(
     points: Float[Tensor, "n 3"], weights: Float[Tensor, "n J"], transforms: Float[Tensor, "J 4 4"]
 ) -> Float[Tensor, "n 3"]:
-    """`skin` of a body, metres; its loops are compiled where those of `blend_transforms` are."""
-    if can_compile(points, weights, transforms) and not weights.requires_grad:
+    """`skin` of a body, metres, with compiled loops in the same cases as `blend_transforms`."""
+    if has_kernel(points, weights, transforms) and not weights.requires_grad:
         return _Skin.apply(points, weights, transforms)  # type: ignore[return-value]
     return move_points(points, blend_transforms(weights, transforms))
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from twofold.body import kinematics_kernels as kernels
-from twofold.body.blending import can_compile, move_points, skin_vertices
+from twofold.body.blending import has_kernel, move_points, skin_vertices
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigid_transform
 from twofold.npz import are_moderate
@@ -213,9 +213,9 @@ def joint_transforms(
     The root turns about its own rest joint and `translation` is added afterwards, SMPL's own convention. The result
     acts on points of the T-pose (it is already relative to the rest joints).
 
-    In single precision on a CPU it is one compiled loop, differentiable once; elsewhere many operations.
+    Where `has_kernel` says so it is one compiled loop, differentiable once.
     """
-    if can_compile(joints, pose, translation):
+    if has_kernel(joints, pose, translation):
         return _Kinematics.apply(joints, pose, translation)  # type: ignore[return-value]
     return joint_transforms_of_rotations(joints, axis_angle_to_matrix(pose), translation)
 
@@ -224,7 +224,7 @@ def joint_transforms_of_rotations(
     joints: Float[Tensor, "24 3"], rotations: Float[Tensor, "*b 24 3 3"], translation: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 24 4 4"]:
     """`joint_transforms` of a pose given as rotation matrices, root first."""
-    if can_compile(joints, rotations, translation):
+    if has_kernel(joints, rotations, translation):
         return _Kinematics.apply(joints, rotations, translation)  # type: ignore[return-value]
     rest = joints.unbind()
     above = torch.stack([rest[parent] for parent in PARENTS[1:]])
