@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from twofold.kernels.row_gradient import RowGradient, adam_rows
+from twofold.kernels.visited_rows import visited_rows
 from twofold.methods.base import Avatar
 from twofold.methods.parameter_group import ParameterGroup
 from twofold.recipe import TrainingConfig
@@ -95,6 +96,32 @@ def shrink(
     return step * (1 - shrinkage / ratio.clamp_min(1e-6)).clamp_min(0)
 
 
+def visited_rows_in_torch(
+    table: Float[Tensor, "rows *numbers"], first: Float[Tensor, "rows *numbers"],
+    second: Float[Tensor, "rows *numbers"], gradient: Float[Tensor, "rows *numbers"], visits: Float[Tensor, "rows"],
+    sums: Float[Tensor, "2 *entries"] | None, rate: float, betas: tuple[float, float], epsilon: float,
+    shrinkage: float, pooled: float,
+) -> None:  # fmt: skip
+    """What `twofold.kernels.visited_rows.visited_rows` does, for any device and precision."""
+    beta1, beta2 = betas
+    seen = gradient.reshape(len(gradient), -1).abs().amax(1).nonzero()[:, 0]
+    g = gradient[seen]
+    visits[seen] += 1
+    times = visits[seen].view(-1, *[1] * (table.dim() - 1))
+    first[seen] = beta1 * first[seen] + (1 - beta1) * g
+    second[seen] = beta2 * second[seen] + (1 - beta2) * g.square()
+    root = (second[seen] / (1 - beta2**times)).sqrt() + epsilon
+    step = first[seen] / (1 - beta1**times) / root
+    if sums is not None:
+        rows = step if step.dim() > 1 else step[:, None]
+        known, noise = visits[seen] >= 2, noise_share(visits[seen], beta1)
+        if known.any():
+            new = signal_sums(rows[known], noise[known], beta1) / rows.shape[-1]
+            sums.mul_(1 - (new[1] / pooled).clamp_max(1)).add_(new)
+        step = shrink(rows, sums[0] / (sums[1] + 1), noise, shrinkage).view_as(step)
+    table[seen] -= rate * step
+
+
 def few_visits(groups: Iterable[ParameterGroup], training: TrainingConfig, times: int) -> str | None:
     """What to tell the user where corrections of poses shrink and frames are visited too seldom for that; else None.
 
@@ -150,46 +177,36 @@ class RowAdam(torch.optim.Adam):
             table.grad = None
         if not self.state[table] and not gradient.marks.any():
             return
-        first, second, step = self._advanced(table)
-        adam_rows(table, first, second, gradient, group["lr"], step, group["betas"], group["eps"])
+        first, second = self._advanced(table)
+        number = int(self.state[table]["step"])
+        adam_rows(table, first, second, gradient, group["lr"], number, group["betas"], group["eps"])
 
     def _step_visited(self, table: nn.Parameter, group: dict[str, Any]) -> None:
-        gradient, (beta1, beta2) = table.grad, group["betas"]
+        gradient, table.grad = table.grad, None
         if gradient is None:
             return
-        first, second, _ = self._advanced(table)
-        count = self.state[table].setdefault("visits", torch.zeros(len(table), device=table.device))
-        seen = gradient.reshape(len(gradient), -1).abs().amax(1).nonzero()[:, 0]
-        g, table.grad = gradient[seen], None
-        count[seen] += 1
-        times = count[seen].view(-1, *[1] * (table.dim() - 1))
-        first[seen] = beta1 * first[seen] + (1 - beta1) * g
-        second[seen] = beta2 * second[seen] + (1 - beta2) * g.square()
-        root = (second[seen] / (1 - beta2**times)).sqrt() + group["eps"]
-        step = first[seen] / (1 - beta1**times) / root
-        if group.get("shrinkage"):
-            step = self._shrunk(table, step, count, seen, group)
-        table[seen] -= group["lr"] * step
+        first, second = self._advanced(table)
+        state, shrinkage, sums = self.state[table], group.get("shrinkage") or 0.0, None
+        if "visits" not in state:
+            state["visits"] = torch.zeros(len(table), device=table.device)
+        if shrinkage:
+            if "signal_sums" not in state:
+                state["signal_sums"] = torch.zeros(2, *table.shape[1:-1], device=table.device)
+            sums = state["signal_sums"]
+        step = visited_rows if _compiles(table) and _compiles(first) and _compiles(second) else visited_rows_in_torch
+        step(
+            table, first, second, gradient, state["visits"], sums, group["lr"], group["betas"], group["eps"], shrinkage,
+            POOLED_VISITS,
+        )  # fmt: skip
 
-    def _shrunk(self, table: nn.Parameter, step: Tensor, count: Tensor, seen: Tensor, group: dict[str, Any]) -> Tensor:
-        """The steps of the rows seen, shrunk by the share of signal in recent visits of all rows."""
-        beta, state = group["betas"][0], self.state[table]
-        sums = state.setdefault("signal_sums", torch.zeros(2, *table.shape[1:-1], device=table.device))
-        rows = step if step.dim() > 1 else step[:, None]
-        known, noise = count[seen] >= 2, noise_share(count[seen], beta)
-        if known.any():
-            new = signal_sums(rows[known], noise[known], beta) / rows.shape[-1]
-            sums.mul_(1 - (new[1] / POOLED_VISITS).clamp_max(1)).add_(new)
-        return shrink(rows, sums[0] / (sums[1] + 1), noise, group["shrinkage"]).view_as(step)
-
-    def _advanced(self, table: nn.Parameter) -> tuple[Tensor, Tensor, int]:
-        """The means of a table's gradients and of their squares, zero at first, and the number of this step."""
+    def _advanced(self, table: nn.Parameter) -> tuple[Tensor, Tensor]:
+        """The means of a table's gradients and of their squares, zero at first; counts the step."""
         state = self.state[table]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32)
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(table), torch.zeros_like(table)
         state["step"] += 1
-        return state["exp_avg"], state["exp_avg_sq"], int(state["step"])
+        return state["exp_avg"], state["exp_avg_sq"]
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """See `torch.optim.Optimizer.load_state_dict`; rows that had a gradient are known by their squares."""
@@ -205,6 +222,11 @@ def _by_visit(parameter: nn.Parameter, group: dict[str, Any]) -> bool:
     A body model without shapes has an empty list of them.
     """
     return bool(group.get("by_visit") and len(parameter) and (parameter.dim() > 1 or group.get("shrinkage")))
+
+
+def _compiles(tensor: Tensor) -> bool:
+    """Whether compiled loops can change a tensor in place."""
+    return tensor.device.type == "cpu" and tensor.dtype == torch.float32 and tensor.is_contiguous()
 
 
 def make_optimizer(
