@@ -30,7 +30,7 @@ def test_parts_cover_the_range_once_and_in_order(count, least, allowed):
         patch.setattr(torch, "get_num_threads", lambda: allowed)
         parts = in_parts(count, lambda begin, end: (begin, end), least)
     assert list(chain.from_iterable(range(*part) for part in parts)) == list(range(count))
-    assert 1 <= len(parts) <= allowed
+    assert 1 <= len(parts) <= (parallel.PARTS_EACH * allowed if allowed > 1 else 1)
     assert len(parts) == 1 or min(end - begin for begin, end in parts) >= least
 
 
@@ -46,6 +46,43 @@ def test_an_error_in_a_part_is_raised(threads):
 
     with pytest.raises(ValueError, match="the last part"):
         in_parts(10, work, least=1)
+    # No thread keeps the mark that it is inside a part.
+    assert list(chain.from_iterable(range(*part) for part in in_parts(9, lambda *part: part, least=1))) == list(
+        range(9)
+    )
+    assert len(in_parts(9, lambda *part: part, least=1)) == (1 if threads == 1 else 6)
+
+
+def test_a_thread_that_is_done_takes_the_parts_that_are_left(monkeypatch):
+    """Where one core is slow, or a part long, the other threads handle the rest."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    rest = threading.Barrier(1 + 1, timeout=20)
+    done = []
+
+    def work(begin, end):
+        if begin == 0:
+            rest.wait()  # until all others are done
+        done.append((begin, threading.get_ident()))
+        if len(done) == 2 * parallel.PARTS_EACH - 1:
+            rest.wait()
+
+    in_parts(100, work, least=1)
+    assert done[-1][0] == 0
+    assert len({thread for begin, thread in done if begin}) == 1
+
+
+def test_this_thread_takes_all_where_no_other_begins(monkeypatch):
+    """The pool's one thread is kept busy until afterwards."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    begun, ended = threading.Event(), threading.Event()
+    busy = parallel._pool(1).submit(lambda: (begun.set(), ended.wait(20)))
+    assert begun.wait(20)
+    try:
+        threads = in_parts(100, lambda begin, end: threading.get_ident(), least=1)
+        assert set(threads) == {threading.get_ident()}
+    finally:
+        ended.set()
+        assert busy.result()[1]
 
 
 def test_a_compiled_loop_is_the_plain_one_even_if_something_wraps_it():
@@ -113,7 +150,7 @@ def test_operations_take_one_thread_and_ranges_are_still_cut():
     try:
         with one_thread_each():
             assert torch.get_num_threads() == 1
-            assert len(in_parts(30, lambda begin, end: None, least=1)) == 3
+            assert len(in_parts(30, lambda begin, end: None, least=1)) == 3 * parallel.PARTS_EACH
         assert torch.get_num_threads() == 3
         with pytest.raises(ValueError, match="inside"), one_thread_each():
             raise ValueError("inside")

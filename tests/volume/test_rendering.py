@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from packed_samples import packed
 
 from twofold.geometry.cameras import Rays
-from twofold.volume.rendering import composite, composite_weights, laplace_density
+from twofold.volume.rendering import composite, composite_surface, composite_weights, laplace_density
 from twofold.volume.samples import Samples
 
 
@@ -147,3 +147,51 @@ def test_compiled_weights_and_their_gradient_are_those_of_the_twin(counts, seed)
 
     for single, double in zip(both(torch.float32), both(torch.float64), strict=True):
         torch.testing.assert_close(single.double(), double, atol=1e-6, rtol=1e-4)
+
+
+def surface_case(counts, seed, dtype=torch.float32):
+    """Distances around a surface, colours, normals, samples, a scale, and a cotangent."""
+    samples = packed(counts, seed, dtype)[0]
+    draw = torch.Generator().manual_seed(seed)
+    count = len(samples)
+    sdf = 0.03 * torch.randn(count, generator=draw, dtype=dtype)
+    color, normals = (torch.rand(count, 3, generator=draw, dtype=dtype) for _ in range(2))
+    by_out = torch.randn(len(counts), 8, generator=draw, dtype=dtype)
+    return sdf, torch.tensor(0.02, dtype=dtype), color, normals, samples, by_out
+
+
+def step_by_step(sdf, beta, color, normals, samples, rays):
+    weights = composite_weights(laplace_density(sdf, beta), samples)
+    values = torch.cat([color, torch.ones_like(color[:, :1]), samples.depth[:, None], normals], -1)
+    return composite(weights, values, samples, rays)
+
+
+@settings(max_examples=30, deadline=None)
+@given(counts=COUNTS, seed=st.integers(0, 2**20))
+def test_surfaces_are_composited_at_once_as_step_by_step(counts, seed):
+    """Values and gradients, in single precision against the steps in double precision."""
+    results = []
+    for dtype, render in ((torch.float32, composite_surface), (torch.float64, step_by_step)):
+        sdf, beta, color, normals, samples, by_out = surface_case(counts, seed)
+        sdf, beta, color, normals, by_out = (t.to(dtype) for t in (sdf, beta, color, normals, by_out))
+        samples = Samples(samples.ray_index, samples.depth.to(dtype), samples.delta.to(dtype))
+        learned = [t.requires_grad_() for t in (sdf, beta, color)]
+        out = render(*learned, normals, samples, len(counts))
+        out.backward(by_out)
+        results.append([out.detach(), *(t.grad if t.grad is not None else torch.zeros_like(t) for t in learned)])
+    for ours, twin in zip(*results, strict=True):
+        size = max(1.0, *twin.abs().flatten().tolist(), 0.0)
+        torch.testing.assert_close(ours.double(), twin, rtol=2e-4, atol=2e-5 * size)
+
+
+def test_surfaces_composited_at_once_pass_gradcheck_where_they_are_steps():
+    sdf, beta, color, normals, samples, _ = surface_case([3, 0, 4], 1, torch.float64)
+    learned = [t.requires_grad_() for t in (sdf, beta, color)]
+    assert torch.autograd.gradcheck(lambda *t: composite_surface(*t, normals, samples, 3), learned)
+
+
+def test_normals_are_constants_of_a_composited_surface():
+    sdf, beta, color, normals, samples, by_out = surface_case([2, 3], 2)
+    normals.requires_grad_()
+    composite_surface(sdf.requires_grad_(), beta, color, normals, samples, 2).backward(by_out)
+    assert normals.grad is None

@@ -193,10 +193,7 @@ def _by_values(
         return by_nets, by_law
 
     parts = in_parts(count, part)
-    tables = [
-        _scattered(lookups.scatter, table, rows, grid, given[0], u)
-        for table, rows, grid, u in zip((field.low, field.high), field.rows, grids, features, strict=True)
-    ]
+    tables = _scattered(lookups.scatter, field, grids, given[0], [(u,) for u in features])
     by_law = _summed([law for _, law in parts])
     return [points if by_x else None, by_law, *tables, *_by_nets([nets for nets, _ in parts])]
 
@@ -213,12 +210,8 @@ def _by_slopes(field: FusedField, given: Any, by_g: np.ndarray) -> list[Tensor |
         return by_nets
 
     parts = in_parts(count, part)
-    tables = [
-        _scattered(lookups.scatter_slopes, table, rows, grid, given[0], u, slope)
-        for table, rows, grid, u, slope in zip(
-            (field.low, field.high), field.rows, grids, features, (by_g, pushed), strict=True
-        )
-    ]
+    slopes = list(zip(features, (by_g, pushed), strict=True))
+    tables = _scattered(lookups.scatter_slopes, field, grids, given[0], slopes)
     return [*tables, *_by_nets(parts)]
 
 
@@ -245,14 +238,20 @@ def _by_nets(parts: list[list[tuple[np.ndarray, ...]]]) -> list[Tensor]:
 
 
 def _scattered(
-    kernel: Callable[..., None], table: Tensor, rows: RowGradient | None, grid: Any, *arrays: np.ndarray
-) -> Tensor | None:
-    """Gradient by a table, or None where it is added to `rows`; a level owns its rows, so levels run side by side."""
-    by_table = None
-    if rows is None:
-        by_table = torch.zeros_like(table)
-        values, marks = by_table.numpy(), _NO_MARKS
-    else:
-        values, marks = rows.values, rows.marks
-    in_parts(len(grid[2]), lambda begin, end: kernel(*arrays, grid, values, marks, begin, end), least=1)
-    return by_table
+    kernel: Callable[..., None], field: FusedField, grids: Any, x: np.ndarray, arrays: list[tuple[np.ndarray, ...]]
+) -> list[Tensor | None]:
+    """Gradients by both tables, None where they are added to `rows`; a level owns its rows: levels run side by side."""
+    found, tasks = list[Tensor | None](), list[tuple[Any, int]]()
+    for table, rows, grid, own in zip((field.low, field.high), field.rows, grids, arrays, strict=True):
+        by_table = torch.zeros_like(table) if rows is None else None
+        values, marks = (by_table.numpy(), _NO_MARKS) if rows is None else (rows.values, rows.marks)  # type: ignore[union-attr]
+        given = (x, *own, grid, values, marks)
+        tasks += [(given, level) for level in range(len(grid[2]))]
+        found.append(by_table)
+
+    def part(begin: int, end: int) -> None:
+        for given, level in tasks[begin:end]:
+            kernel(*given, level, level + 1)
+
+    in_parts(len(tasks), part, least=1)
+    return found

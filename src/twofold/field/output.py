@@ -2,9 +2,17 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
+
+from twofold.field import output_kernels as kernels
+from twofold.kernels.parallel import in_parts
+
+_LEAST = 1e-6
+"""Shorter gradients than this have shorter normals."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +39,14 @@ class FieldOutput:
         """
         if self.gradient is None:
             raise ValueError("normals need the gradient of the distance; this field gave none")
-        return F.normalize((to_observation * self.gradient[:, None]).sum(-1), dim=-1, eps=1e-6)
+        wanted = torch.is_grad_enabled() and (self.gradient.requires_grad or to_observation.requires_grad)
+        if wanted or self.gradient.is_cuda or not self.gradient.dtype == to_observation.dtype == torch.float32:
+            return F.normalize((to_observation * self.gradient[:, None]).sum(-1), dim=-1, eps=_LEAST)
+        out = torch.empty_like(self.gradient, memory_format=torch.contiguous_format)
+        turn, gradient = (t.detach().contiguous().numpy() for t in (to_observation, self.gradient))
+        given = (turn, gradient, np.float32(_LEAST), out.numpy())
+        in_parts(len(out), lambda begin, end: kernels.turned(*given, begin, end), least=8192)
+        return out
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,11 @@
 
 import contextlib
 import inspect
+import itertools
 import sys
 import threading
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextvars import ContextVar
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +21,8 @@ Result = TypeVar("Result")
 Item = TypeVar("Item")
 _PARTS: ContextVar[int | None] = ContextVar("_PARTS", default=None)
 """How many parts ranges are cut into, where it is not PyTorch's number of threads."""
+PARTS_EACH = 2
+"""Parts for each thread: more even out better and cost more calls."""
 _INSIDE = threading.local()
 """Tells whether this thread already handles a part: it does not share that out again."""
 _OPTIONS: dict[str, Any] = {"nogil": True, "no_cfunc_wrapper": True}
@@ -113,14 +116,15 @@ def _parts() -> int:
 
 @lru_cache(maxsize=4)
 def _pool(threads: int) -> ThreadPoolExecutor:
-    def begin() -> None:
-        _INSIDE.part = True
-
-    return ThreadPoolExecutor(threads, thread_name_prefix="twofold", initializer=begin)
+    return ThreadPoolExecutor(threads, thread_name_prefix="twofold")
 
 
 def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) -> list[Result]:
     """Calls `work(begin, end)` on parts of 0..count, side by side; `work` must let go of the interpreter's lock.
+
+    There are more parts than threads, and each thread takes the next part when it is done with one: parts of unequal
+    work, or a core that another process uses, keep nobody waiting for long. This thread takes parts like the others.
+    Which thread takes a part changes nothing, so what is summed over the parts in order repeats to the bit.
 
     Args:
         count: size of the whole range.
@@ -130,11 +134,33 @@ def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) 
     Returns:
         what `work` gave for each part, in order.
     """
-    threads = max(1, min(_parts(), count // max(least, 1)))
+    most = max(1, count // max(least, 1))
+    threads = min(_parts(), most)
     if threads == 1:
         return [work(0, count)]
-    bounds = [count * part // threads for part in range(threads + 1)]
-    return list(_pool(threads).map(work, bounds[:-1], bounds[1:]))
+    parts = min(threads * PARTS_EACH, most)
+    bounds = [count * part // parts for part in range(parts + 1)]
+    results: list[Result | None] = [None] * parts
+    following = itertools.count()
+
+    def take() -> None:
+        _INSIDE.part = True
+        try:
+            while (part := next(following)) < parts:
+                results[part] = work(bounds[part], bounds[part + 1])
+        finally:
+            _INSIDE.part = False
+
+    others = [_pool(threads - 1).submit(take) for _ in range(threads - 1)]
+    try:
+        take()
+    finally:
+        # Whoever has not begun finds nothing left to do, unless this thread failed.
+        wait([other for other in others if not other.cancel()])
+    for other in others:
+        if not other.cancelled():
+            other.result()
+    return results  # type: ignore[return-value]
 
 
 def ahead(items: Iterable[Item]) -> Generator[Item]:

@@ -120,6 +120,7 @@ class Completion(nn.Module):
         self.register_buffer("vertices", vertices.clone(), persistent=False)
         self.register_buffer("normals", vertex_normals(vertices, shaped.faces), persistent=False)
         self._surface: _Surface | None = None
+        self._shares: tuple[float, float] | None = None
         self.register_load_state_dict_post_hook(lambda own, _: own._forget())
 
     def prepare(self, coverage: Coverage, facing: Float[Tensor, "V"]) -> None:
@@ -151,7 +152,7 @@ class Completion(nn.Module):
         state.setdefault(f"{prefix}placed", state.get(f"{prefix}weight", self.placed))
 
     def _forget(self) -> None:
-        self._surface = None
+        self._surface = self._shares = None
 
     def _on_surface(self) -> "_Surface":
         """What follows from coverage alone."""
@@ -225,7 +226,9 @@ class Completion(nn.Module):
 
     def _weights(self) -> tuple[float, float]:
         """Weights of the terms of colour and shape: the settings times shares of the surface, tiny ones left out."""
-        color, shape = (share if share > LEAST_SHARE else 0.0 for share in (self.unobserved, self.unplaced))
+        if self._shares is None:
+            self._shares = self.unobserved, self.unplaced
+        color, shape = (share if share > LEAST_SHARE else 0.0 for share in self._shares)
         return self.config.color * color, self.config.shape * shape
 
     def is_due(self, step: int) -> bool:

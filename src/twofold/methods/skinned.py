@@ -33,7 +33,7 @@ from twofold.metrics.perceptual import LPIPS
 from twofold.sampling.placement import Deformation, FieldQuery, Placement, Sampler
 from twofold.sampling.posed_surface import PosedSurface
 from twofold.sampling.shell import Shell
-from twofold.volume.rendering import composite, composite_weights, laplace_density
+from twofold.volume.rendering import composite_surface
 from twofold.volume.samples import Samples
 
 Posed = PosedAvatar[SkinnedPose]
@@ -299,33 +299,33 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         x_canonical, by_posed = placed.differentiable(posed.own.surface)
         to_observation = self._normal_matrices(x_canonical, by_posed, posed)
         answer = self.field(x_canonical, posed.own.condition, to_observation)
-        normals = answer.normals(to_observation)
-        whole = self._composite(answer, normals, samples, outlier, behind, rays)
+        turn = to_observation.detach()  # Normals are shown, and nothing learns from them.
+        whole = self._composite(answer, turn, samples, outlier, behind, rays)
         if answer.base is None:
             return whole
         # The base rendering's normals are its own branch's, at the same samples.
-        normals = answer.base.normals(to_observation)
-        return replace(whole, base=self._composite(answer.base, normals, samples, outlier, behind, rays))
+        return replace(whole, base=self._composite(answer.base, turn, samples, outlier, behind, rays))
 
     def place(self, rays: Rays, posed: Posed, mode: Mode, generator: torch.Generator | None) -> Placement:
         """The samples that `render` shades."""
         version = (self._steps, *(parameter._version for parameter in self.field.parameters()))
         recent_grid = self.training_grid.grid() if mode.training and self.training_grid is not None else None
         costly = self.field.dense and not mode.training
-        query = FieldQuery(self.field.sdf_at(posed.own.condition), self.beta, version, costly, recent_grid)
+        with torch.no_grad():
+            distance = self.field.sdf_at(posed.own.condition)
+        query = FieldQuery(distance, self.beta, version, costly, recent_grid)
         placed = self._sampler.place(rays, posed.own.surface, query, mode.training, generator)
         shading = self.config.outliers_in_shading and not mode.training
         return placed if shading else replace(placed, outlier=torch.zeros_like(placed.outlier))
 
     def _composite(
-        self, answer: FieldOutput, normals: Tensor, samples: Samples, outlier: Tensor, background: Tensor, rays: int
+        self, answer: FieldOutput, turn: Tensor, samples: Samples, outlier: Tensor, background: Tensor, rays: int
     ) -> Rendering:
+        with torch.no_grad():
+            normals = answer.normals(turn)
         sdf = torch.where(outlier, 4.0, answer.sdf)
-        scaled = Samples(samples.ray_index, samples.depth, samples.delta * self.scale)
-        weights = composite_weights(laplace_density(sdf, self.beta), scaled)
-        ones = torch.ones_like(sdf)[:, None]
-        values = torch.cat([answer.color, ones, samples.depth[:, None], normals.detach()], -1)
-        out = composite(weights, values, samples, rays)
+        scaled = replace(samples, delta=samples.delta * self.scale)
+        out = composite_surface(sdf, self.beta, answer.color, normals, scaled, rays)
         opacity = out[:, 3]
         depth = out[:, 4] / opacity.detach().clamp_min(1e-6)
         return Rendering(out[:, :3] + (1 - opacity[:, None]) * background, opacity, depth, out[:, 5:8])

@@ -8,13 +8,91 @@ from twofold.kernels.lanes import LANES
 from twofold.kernels.parallel import compiled, compiled_part
 from twofold.sampling.sdf_grid import KNOWN_BELOW, UNKNOWN
 from twofold.sampling.visibility_kernels import light_passing
-from twofold.sampling.walk_kernels import FAR, find_nearest, grown, is_closer, map_back, on_ray, row_at, weigh
+from twofold.sampling.walk_kernels import (
+    FAR,
+    divide,
+    find_nearest,
+    grown,
+    is_closer,
+    map_back,
+    map_candidates,
+    on_ray,
+    row_at,
+    weigh,
+)
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _KNOWN, _NOWHERE = np.float32(KNOWN_BELOW), np.float32(UNKNOWN)
 
 
 @compiled
+def choose(  # noqa: ANN201
+    shell, rays, canonical, limit, slack, smooth, scale, forward, k, grid, light, spacing, parts, begin, end  # noqa: ANN001
+):  # fmt: skip
+    """The samples of rays begin..end that may add more than a little by what a grid knows.
+
+    Args:
+        shell: of this and all others but two see `search`.
+        rays: see above.
+        canonical: see above.
+        limit: see above.
+        slack: see above.
+        smooth: see above.
+        scale: see above.
+        forward: see above.
+        k: see above.
+        grid: see above.
+        light: see above.
+        spacing: see above.
+        parts: into how many the step of each candidate is divided.
+        begin: first ray.
+        end: ray behind the last.
+
+    Returns:
+        ray, depth, k nearest vertices and their weights, canonical point and inverse transform [S 12] of each sample.
+    """
+    found = search(
+        shell, rays, canonical, limit, slack, smooth, scale, forward, k, grid, light, spacing, begin, end
+    )  # fmt: skip
+    if parts > 1:
+        found = divide(shell, rays, found, parts)
+    ray_at, depth_at = found[0], found[1]
+    number, vertex, weight, point, inverse, _, _, _ = map_candidates(
+        shell, rays, canonical, limit, slack, smooth, scale, forward, k, found, np.arange(len(ray_at)), 0, len(ray_at)
+    )
+    possible = np.empty(len(number), np.bool_)
+    mark_possible(number, ray_at, point, grid, light[0], light[1], np.float32(rays[5] / parts), possible)
+    return _those(possible, ray_at[number], depth_at[number], vertex, weight, point, inverse)
+
+
+@compiled
+def keep_seen(sdf, beta, least, step, ray_at, depth_at, vertex, weight, point, inverse):  # noqa: ANN001, ANN201
+    """Those of some samples that add more than a little to their pixels by their distances `sdf`; see `choose`."""
+    seen = np.empty(len(sdf), np.bool_)
+    ray, through = -1, _ONE
+    for i in range(len(sdf)):
+        if ray_at[i] != ray:
+            ray, through = ray_at[i], _ONE
+        passing = light_passing(sdf[i], beta, step)
+        seen[i] = through * (_ONE - passing) > least
+        through *= passing
+    return _those(seen, ray_at, depth_at, vertex, weight, point, inverse)
+
+
+@compiled_part
+def _those(chosen, ray_at, depth_at, vertex, weight, point, inverse):  # noqa: ANN001, ANN202
+    """The samples that are chosen, moved to the front of the arrays."""
+    count = 0
+    for i in range(len(chosen)):
+        if chosen[i]:
+            ray_at[count], depth_at[count] = ray_at[i], depth_at[i]
+            vertex[count], weight[count] = vertex[i], weight[i]
+            point[count], inverse[count] = point[i], inverse[i]
+            count += 1
+    return ray_at[:count], depth_at[:count], vertex[:count], weight[:count], point[:count], inverse[:count]
+
+
+@compiled_part
 def search(  # noqa: ANN201
     shell, rays, canonical, limit, slack, smooth, scale, forward, k, grid, light, spacing, begin, end  # noqa: ANN001
 ):  # fmt: skip

@@ -31,6 +31,8 @@ _Leap = tuple[float, np.ndarray, np.ndarray]
 """Share of the distance to the surface that a ray leaps over; each ray's next candidate, and where these end."""
 _OnRays = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Number of the ray, depth and row of the shell's lists of candidates, ray by ray."""
+_POINT = 4
+"""The canonical points among the arrays that `search_kernels.choose` returns."""
 _GOOD = 6
 """Arrays that describe the samples in what `walk_kernels.map_candidates` returns; the others are of those left out."""
 _FOLLOWED = (0, 3, 5)
@@ -112,41 +114,33 @@ class Walk:
                 count, or not at all if that is costly.
         """
         parts = parts_of_step(self.step, float(query.beta.detach()), finest)
-        if grid is None:
-            coarse = self._search(query, least, share)
-            if parts == 1 or len(coarse[0]) == 0:
-                return self._placement(*coarse)
-            found = tuple(array[coarse[0]] for array in self.on_rays)
-        else:
-            found = self._search_by(grid, query, least, share)
-        if parts > 1:
-            found = walk_kernels.divide(self.given[0], self.given[1], found, parts)
-        return replace(self, step=self.step / parts, chosen=found)._seen_of_all(query, least, grid)
+        if grid is not None:
+            return self._seen_by(grid, query, least, share, parts)
+        coarse = self._search(query, least, share)
+        if parts == 1 or len(coarse[0]) == 0:
+            return self._placement(*coarse)
+        finer = walk_kernels.divide(self.given[0], self.given[1], tuple(a[coarse[0]] for a in self.on_rays), parts)
+        walk = replace(self, step=self.step / parts, chosen=finer)
+        found, through = walk._mapped(np.arange(len(finer[0])))[:_GOOD], np.ones(len(self.ray_ids), np.float32)
+        seen = walk._follow(*(found[part] for part in _FOLLOWED), query, least, through, None)
+        return walk._placement(*(array[seen] for array in found))
 
-    def _seen_of_all(self, query: FieldQuery, least: float, grid: SdfGrid | None) -> Placement:
-        """`seen`, of which every sample is looked at, in one go, unless a grid knows that it does not count."""
-        found = self._mapped(np.arange(len(self.on_rays[0])))[:_GOOD]
-        queried = np.arange(len(found[0])) if grid is None else self._possible(grid, found, query, least)
-        if grid is not None and query.costly:
-            return self._placement(*(array[queried] for array in found))
-        through = np.ones(len(self.ray_ids), np.float32)
-        number, point, away = (found[part][queried] for part in _FOLLOWED)
-        seen = queried[self._follow(number, point, away, query, least, through, None)]
-        return self._placement(*(array[seen] for array in found))
+    def _seen_by(self, grid: SdfGrid, query: FieldQuery, least: float, share: float, parts: int) -> Placement:
+        """`seen` with a grid, some rays in each thread; steps are divided into so many parts."""
+        beta, step = np.float32(query.beta.detach()), self.step / parts
+        light = (beta, *(np.float32(number) for number in (least, share, self._guard(query, least))))
+        given = (*self.given, grid.arrays(), light, np.float32(self.spacing), parts)
 
-    def _possible(self, grid: SdfGrid, found: list[np.ndarray], query: FieldQuery, least: float) -> np.ndarray:
-        """Which of these mapped candidates may count by what a grid knows."""
-        possible = np.empty(len(found[0]), bool)
-        light = np.float32(query.beta.detach()), np.float32(least), np.float32(self.step)
-        search_kernels.mark_possible(found[0], self.on_rays[0], found[3], grid.arrays(), *light, possible)
-        return np.flatnonzero(possible)
+        def seen(begin: int, end: int) -> tuple[np.ndarray, ...]:
+            found = search_kernels.choose(*given, begin, end)
+            if query.costly:
+                return found
+            with torch.no_grad():  # Which is a setting of each thread.
+                sdf = query.distance(torch.from_numpy(found[_POINT])).float().contiguous().numpy()
+            return search_kernels.keep_seen(sdf, beta, np.float32(least), np.float32(step), *found)
 
-    def _search_by(self, grid: SdfGrid, query: FieldQuery, least: float, share: float) -> _OnRays:
-        """The candidates that may count by what a grid knows."""
-        numbers = float(query.beta.detach()), least, share, self._guard(query, least)
-        light = tuple(np.float32(number) for number in numbers)
-        given = (*self.given, grid.arrays(), light, np.float32(self.spacing))
-        return _joined(in_parts(len(self.ray_ids), lambda b, e: search_kernels.search(*given, b, e), least=_FEW_RAYS))
+        found = _joined(in_parts(len(self.ray_ids), seen, least=_FEW_RAYS))
+        return replace(self, step=step)._placed(*found)
 
     def _search(self, query: FieldQuery, least: float, share: float) -> list[np.ndarray]:
         """What `_mapped` says of the samples that `seen` looks for, in steps of the walk."""
@@ -206,10 +200,14 @@ class Walk:
         self, number: np.ndarray, vertex: np.ndarray, weight: np.ndarray, point: np.ndarray, inverse: np.ndarray,
         _away: np.ndarray,
     ) -> Placement:  # fmt: skip
-        depth = torch.from_numpy(self.on_rays[1][number])
-        samples = Samples(
-            self.ray_ids[torch.from_numpy(self.on_rays[0][number])], depth, torch.full_like(depth, self.step)
-        )
+        return self._placed(self.on_rays[0][number], self.on_rays[1][number], vertex, weight, point, inverse)
+
+    def _placed(
+        self, ray_at: np.ndarray, depth_at: np.ndarray, vertex: np.ndarray, weight: np.ndarray, point: np.ndarray,
+        inverse: np.ndarray,
+    ) -> Placement:  # fmt: skip
+        depth = torch.from_numpy(depth_at)
+        samples = Samples(self.ray_ids[torch.from_numpy(ray_at)], depth, torch.full_like(depth, self.step))
         arrays = (torch.from_numpy(vertex), torch.from_numpy(weight), torch.zeros(len(depth), dtype=torch.bool))
         return Placement(samples, *arrays, torch.from_numpy(point), torch.from_numpy(inverse).unflatten(1, (3, 4)))
 

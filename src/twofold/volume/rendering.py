@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -110,3 +111,61 @@ def composite(
     """
     out = torch.zeros(rays, values.shape[-1], dtype=values.dtype, device=values.device)
     return out.index_add(0, samples.ray_index, weights[:, None] * values)
+
+
+def composite_surface(
+    sdf: Float[Tensor, "S"], beta: Float[Tensor, ""], color: Float[Tensor, "S 3"], normals: Float[Tensor, "S 3"],
+    samples: Samples, rays: int,
+) -> Float[Tensor, "rays 8"]:  # fmt: skip
+    r"""Colour, opacity, depth and normal of each ray: `laplace_density`, `composite_weights` and `composite` in one.
+
+    \[ \big( \hat C, \hat A, \hat D, \hat N \big)(r) = \sum_i w_i \, (c_i, 1, t_i, n_i), \qquad
+    w_i = e^{-\sum_{j<i} \sigma(s_j) \delta_j} \, (1 - e^{-\sigma(s_i) \delta_i}) \]
+
+    Differentiable by distances, colours and scale; normals count as constants. On CPUs in single precision it is one
+    compiled loop with a reverse pass written by hand.
+
+    >>> samples = Samples(torch.tensor([0, 0]), torch.tensor([1.0, 2.0]), torch.ones(2))
+    >>> red, up = torch.tensor([[1.0, 0.0, 0.0]] * 2), torch.tensor([[0.0, 1.0, 0.0]] * 2)
+    >>> composite_surface(torch.zeros(2), torch.tensor(0.721348), red, up, samples, rays=1)  # each lets half through
+    tensor([[0.7500, 0.0000, 0.0000, 0.7500, 1.0000, 0.0000, 0.7500, 0.0000]])
+
+    Args:
+        sdf: signed distance of each sample, in the unit of `beta`.
+        beta: scale of the density.
+        color: of each sample.
+        normals: of each sample.
+        samples: packed, lengths in the unit of `beta`.
+        rays: how many there are.
+    """
+    normals = normals.detach()
+    if sdf.dtype == torch.float32 and not sdf.is_cuda:
+        given = samples.depth, samples.delta, samples.ray_index, rays
+        return _Surface.apply(sdf, beta, color, normals, *given)  # type: ignore[return-value]
+    weights = composite_weights(laplace_density(sdf, beta), samples)
+    values = torch.cat([color, torch.ones_like(sdf)[:, None], samples.depth[:, None], normals], -1)
+    return composite(weights, values, samples, rays)
+
+
+class _Surface(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, sdf: Tensor, beta: Tensor, color: Tensor, normals: Tensor, depth: Tensor, delta: Tensor,
+        ray_index: Tensor, rays: int,
+    ) -> Tensor:  # fmt: skip
+        given = tuple(t.detach().contiguous() for t in (sdf, color, normals, depth, delta, ray_index))
+        weight, optical, out = torch.empty_like(given[0]), torch.empty_like(given[0]), torch.zeros(rays, 8)
+        sdf_, *rest = (tensor.numpy() for tensor in given)
+        kernels.surface(sdf_, np.float32(beta), *rest, weight.numpy(), optical.numpy(), out.numpy())
+        ctx.save_for_backward(*given, beta, weight, optical)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_out: Tensor) -> tuple[Tensor | None, ...]:
+        *given, beta, weight, optical = ctx.saved_tensors
+        sdf, *rest = (tensor.numpy() for tensor in given)
+        by_sdf, by_color = torch.empty_like(given[0]), torch.empty_like(given[1])
+        more = (weight.numpy(), optical.numpy(), by_out.contiguous().numpy(), by_sdf.numpy(), by_color.numpy())
+        by_beta = kernels.surface_backward(sdf, np.float32(beta.detach()), *rest, *more)
+        return by_sdf, beta.new_tensor(by_beta), by_color, None, None, None, None, None
