@@ -151,6 +151,23 @@ def test_s3im_lays_576_rays_out_as_24_by_240(monkeypatch):
     assert seen == [(3, 1, 24, 240)]
 
 
+@pytest.mark.parametrize("center", [1.5, 2.0])
+@pytest.mark.parametrize("rays", [4, 9, 36, 41, 300])
+def test_compiled_s3im_and_its_gradient_are_those_of_the_convolutions(rays, center):
+    """Single precision against double precision, which is left to PyTorch."""
+    values, gradients = [], []
+    for dtype in (torch.float32, torch.float64):
+        color = random(rays, 3).float().to(dtype).requires_grad_()
+        truth = random(rays, 3, seed=1).float().to(dtype)
+        assert losses.can_pick(color, truth) == (dtype == torch.float32)
+        loss = losses.s3im(color, truth, torch.Generator().manual_seed(3), center)
+        (0.7 * loss).backward()
+        values.append(loss.detach().double())
+        gradients.append(color.grad.double())
+    torch.testing.assert_close(*values, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-7)
+
+
 @given(rays=st.integers(4, 80), seed=st.integers(0, 1000))
 def test_s3im_is_zero_for_equal_colors_and_at_most_two(rays, seed):
     color, truth = random(rays, 3, seed=seed), random(rays, 3, seed=seed + 1)

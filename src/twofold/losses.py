@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from twofold.config import require_within
+from twofold.kernels.virtual_image import can_pick, picked_ssim
 
 S3IM_REPEATS = 10
 """Orders in which the rays are laid out in the virtual image: as given, then permuted at random."""
@@ -20,6 +21,8 @@ S3IM_SIGMA = 1.5
 """Standard deviation of that window, pixels."""
 S3IM_CENTER = (S3IM_WINDOW - 1) / 2
 """Middle of that window, pixels from its first one; the release has 2."""
+_STABLE = (0.01**2, 0.03**2)
+"""Added to products of means, and of deviations, of colours in 0..1 (Wang et al. 2004)."""
 ENTROPY_OFFSET = 1e-6
 """Added inside the logarithms of `binarisation`."""
 SPARSE_CLEARANCE, SPARSE_EPOCHS = 0.05, 200
@@ -214,8 +217,11 @@ def s3im(
     # Where the rows do not come out even, the last few rays of the last order are left out.
     width = len(order) // height
     order = order[: height * width]
+    window = _window(center, color)
+    if can_pick(color, truth):
+        return 1 - picked_ssim(color, truth, order.view(height, width), window, _STABLE)
     first, second = (c[order].T.reshape(3, 1, height, width) for c in (color, truth))
-    return 1 - _windowed_ssim(first, second, center).mean()
+    return 1 - _windowed_ssim(first, second, window).mean()
 
 
 def squared_error(color: Float[Tensor, "*b"], truth: Float[Tensor, "*b"]) -> Float[Tensor, ""]:
@@ -355,18 +361,22 @@ def _mean_over(values: Tensor, weights: Tensor) -> Tensor:
     return (values * weights).sum() / torch.where(whole > 0, whole, torch.ones_like(whole))
 
 
-def _windowed_ssim(first: Tensor, second: Tensor, center: float) -> Tensor:
-    """Structural similarity of images [n 1 h w] in each window; colours in 0..1."""
-    offsets = torch.arange(S3IM_WINDOW, dtype=first.dtype, device=first.device) - center
+def _window(center: float, like: Tensor) -> Tensor:
+    """Weights of a window's pixels, which sum to 1; the bell's middle is so many pixels from the first one."""
+    offsets = torch.arange(S3IM_WINDOW, dtype=like.dtype, device=like.device) - center
     bell = torch.exp(-offsets.square() / (2 * S3IM_SIGMA**2))
-    window = (bell[:, None] * bell / bell.sum() ** 2)[None, None]
+    return bell[:, None] * bell / bell.sum() ** 2
+
+
+def _windowed_ssim(first: Tensor, second: Tensor, window: Tensor) -> Tensor:
+    """Structural similarity of images [n 1 h w] in each window; colours in 0..1."""
 
     def mean(image: Tensor) -> Tensor:
-        return F.conv2d(image, window, stride=S3IM_WINDOW, padding=1)
+        return F.conv2d(image, window[None, None], stride=S3IM_WINDOW, padding=1)
 
     mean1, mean2 = mean(first), mean(second)
     variance1, variance2 = mean(first.square()) - mean1.square(), mean(second.square()) - mean2.square()
     covariance = mean(first * second) - mean1 * mean2
-    c1, c2 = 0.01**2, 0.03**2
+    c1, c2 = _STABLE
     light = (2 * mean1 * mean2 + c1) / (mean1.square() + mean2.square() + c1)
     return light * (2 * covariance + c2) / (variance1 + variance2 + c2)
