@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -92,10 +93,8 @@ class FusedField:
 
     def arrays(self) -> tuple[Any, Any, np.float32]:
         """Grids, nets and gate as the kernels take them."""
-        grids = tuple(
-            (_array(table), *(_array(tensor) for tensor in (lattice.rows, lattice.place, lattice.shape)))
-            for table, lattice in zip((self.prior, self.low, self.high), self.lattices, strict=True)
-        )
+        tables = (self.prior, self.low, self.high)
+        grids = tuple((_array(table), *grid.arrays) for table, grid in zip(tables, self.lattices, strict=True))
         nets = tuple(tuple(_array(tensor) for tensor in net) for net in self.nets)
         return grids, nets, np.float32(self.gate_width)
 
@@ -185,17 +184,15 @@ def _by_values(
     features = [np.empty((count, table.shape[1] * len(place)), np.float32) for table, _, place, _ in grids]
     points = torch.empty(count, 3)
 
-    def part(begin: int, end: int) -> tuple[list[tuple[np.ndarray, ...]], np.ndarray]:
-        by_nets, by_law = _zeros(field), np.zeros((3, 9), np.float32)
-        kernels.backward(
-            *given, *slopes, *cotangents, *features, points.numpy(), by_x, tuple(by_nets), by_law, begin, end
-        )
+    def part(begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+        (by_nets, views), by_law = _zeros(field), np.zeros((3, 9), np.float32)
+        kernels.backward(*given, *slopes, *cotangents, *features, points.numpy(), by_x, views, by_law, begin, end)
         return by_nets, by_law
 
     parts = in_parts(count, part)
     tables = _scattered(lookups.scatter, field, grids, given[0], [(u,) for u in features])
     by_law = _summed([law for _, law in parts])
-    return [points if by_x else None, by_law, *tables, *_by_nets([nets for nets, _ in parts])]
+    return [points if by_x else None, by_law, *tables, *_by_nets(field, [nets for nets, _ in parts])]
 
 
 def _by_slopes(field: FusedField, given: Any, by_g: np.ndarray) -> list[Tensor | None]:
@@ -204,15 +201,15 @@ def _by_slopes(field: FusedField, given: Any, by_g: np.ndarray) -> list[Tensor |
     features = [np.empty((count, table.shape[1] * len(place)), np.float32) for table, _, place, _ in grids]
     pushed = np.empty((count, 3), np.float32)
 
-    def part(begin: int, end: int) -> list[tuple[np.ndarray, ...]]:
-        by_nets = _zeros(field)
-        kernels.gradient_backward(*given, by_g, *features, pushed, tuple(by_nets), begin, end)
+    def part(begin: int, end: int) -> np.ndarray:
+        by_nets, views = _zeros(field)
+        kernels.gradient_backward(*given, by_g, *features, pushed, views, begin, end)
         return by_nets
 
     parts = in_parts(count, part)
     slopes = list(zip(features, (by_g, pushed), strict=True))
     tables = _scattered(lookups.scatter_slopes, field, grids, given[0], slopes)
-    return [*tables, *_by_nets(parts)]
+    return [*tables, *_by_nets(field, parts)]
 
 
 def _both(one: Tensor | None, other: Tensor | None) -> Tensor | None:
@@ -223,9 +220,14 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def _zeros(field: FusedField) -> list[tuple[np.ndarray, ...]]:
-    """Room for the gradients of all nets."""
-    return [tuple(np.zeros(tuple(tensor.shape), np.float32) for tensor in net) for net in field.nets]
+def _zeros(field: FusedField) -> tuple[np.ndarray, tuple[tuple[np.ndarray, ...], ...]]:
+    """Room for the gradients of all nets in one array, and the places of weights and biases in it, net by net."""
+    tensors = [tensor for net in field.nets for tensor in net]
+    bounds = np.cumsum([0, *(tensor.numel() for tensor in tensors)]).tolist()
+    room = np.zeros(bounds[-1], np.float32)
+    places = zip(tensors, itertools.pairwise(bounds), strict=True)
+    views = [room[begin:end].reshape(tensor.shape) for tensor, (begin, end) in places]
+    return room, tuple(tuple(views[first : first + _LAYERS]) for first in range(0, len(views), _LAYERS))
 
 
 def _summed(parts: list[np.ndarray]) -> Tensor:
@@ -233,8 +235,10 @@ def _summed(parts: list[np.ndarray]) -> Tensor:
     return torch.from_numpy(sum(parts[1:], start=parts[0]))
 
 
-def _by_nets(parts: list[list[tuple[np.ndarray, ...]]]) -> list[Tensor]:
-    return [_summed([part[net][k] for part in parts]) for net in range(4) for k in range(_LAYERS)]
+def _by_nets(field: FusedField, parts: list[np.ndarray]) -> list[Tensor]:
+    tensors = [tensor for net in field.nets for tensor in net]
+    sums = _summed(parts).split([tensor.numel() for tensor in tensors])
+    return [own.view(tensor.shape) for own, tensor in zip(sums, tensors, strict=True)]
 
 
 def _scattered(

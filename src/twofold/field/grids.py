@@ -35,6 +35,11 @@ class Lattices:
     place: Float[Tensor, "L 4"]
     shape: Int[Tensor, "L 4"]
 
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows, place and shape on the CPU as compiled loops take them."""
+        return self.rows.numpy(), self.place.numpy(), self.shape.numpy()
+
 
 def build_lattices(
     points: Float[np.ndarray, "n 3"],
@@ -165,24 +170,20 @@ def pullback_in_torch(
     return total
 
 
-def _arrays(lattices: Lattices) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return lattices.rows.numpy(), lattices.place.numpy(), lattices.shape.numpy()
-
-
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, x: Tensor, lattices: Lattices) -> Tensor:  # type: ignore[override]
         ctx.save_for_backward(table, x)
         ctx.lattices = lattices
         out = np.empty((len(x), table.shape[1] * len(lattices.place)), dtype=np.float32)
-        given = (x.detach().contiguous().numpy(), table.detach().numpy(), *_arrays(lattices), out)
+        given = (x.detach().contiguous().numpy(), table.detach().numpy(), *lattices.arrays, out)
         in_parts(len(x), lambda begin, end: kernels.interpolate(*given, begin, end))
         return torch.from_numpy(out)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # type: ignore[override]
         table, x = ctx.saved_tensors
-        points, slopes, arrays = x.contiguous().numpy(), gradient.contiguous().numpy(), _arrays(ctx.lattices)
+        points, slopes, arrays = x.contiguous().numpy(), gradient.contiguous().numpy(), ctx.lattices.arrays
         by_table = by_x = None
         if ctx.needs_input_grad[0]:
             by_table = torch.zeros_like(table)
@@ -202,14 +203,14 @@ class _Pullback(torch.autograd.Function):
         ctx.save_for_backward(table, x, cotangent)
         ctx.lattices = lattices
         out = torch.empty(len(x), 3)
-        given = (x.numpy(), table.detach().numpy(), cotangent.numpy(), *_arrays(lattices), out.numpy())
+        given = (x.numpy(), table.detach().numpy(), cotangent.numpy(), *lattices.arrays, out.numpy())
         in_parts(len(x), lambda begin, end: kernels.pull(*given, begin, end))
         return out
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, Tensor | None, None]:  # type: ignore[override]
         table, x, cotangent = ctx.saved_tensors
-        arrays, slopes = _arrays(ctx.lattices), gradient.contiguous().numpy()
+        arrays, slopes = ctx.lattices.arrays, gradient.contiguous().numpy()
         by_table = by_cotangent = None
         if ctx.needs_input_grad[0]:
             by_table = torch.zeros_like(table)
