@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 import weakref
 from functools import wraps
 from itertools import chain
@@ -16,6 +17,14 @@ from hypothesis import strategies as st
 
 from twofold.kernels import parallel
 from twofold.kernels.parallel import ahead, compiled, in_parts, one_thread_each
+
+
+@pytest.fixture(autouse=True)
+def sharing(monkeypatch):
+    """What an earlier test found about the load of the machine decides nothing here."""
+    own = parallel._Sharing()
+    monkeypatch.setattr(parallel, "_SHARING", own)
+    return own
 
 
 @pytest.fixture(params=[1, 3])
@@ -69,6 +78,49 @@ def test_a_thread_that_is_done_takes_the_parts_that_are_left(monkeypatch):
     in_parts(100, work, least=1)
     assert done[-1][0] == 0
     assert len({thread for begin, thread in done if begin}) == 1
+
+
+def test_work_is_not_shared_for_a_while_where_threads_only_wait(sharing, monkeypatch):
+    """The clock is the test's own: the work takes as long as one thread would, or half as long."""
+    now = [100.0]
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(parallel.time, "perf_counter", lambda: now[0])
+
+    for _ in range(50):
+        sharing.note(0.0055, 0.01)
+    assert sharing.pays()
+    slow = 0
+    while sharing.pays():
+        sharing.note(0.015, 0.01)
+        slow += 1
+    assert 1 < slow < 20
+    # Work is cut all the same, so results are what they were.
+    ranges = in_parts(100, lambda begin, end: (begin, end, threading.get_ident()), least=1)
+    assert [part[:2] for part in ranges] == [(0, 25), (25, 50), (50, 75), (75, 100)]
+    assert {part[2] for part in ranges} == {threading.get_ident()}
+    now[0] += parallel.REST
+    assert sharing.pays()
+    # Short work says nothing, and one slow work does not decide.
+    for _ in range(50):
+        sharing.note(1e-3, 1e-5)
+    sharing.note(0.02, 0.01)
+    assert sharing.pays()
+
+
+def test_parts_of_busy_threads_are_counted_as_work(sharing, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    noted = []
+    monkeypatch.setattr(sharing, "note", lambda seconds, busy: noted.append((seconds, busy)))
+
+    def work(begin, end):
+        until = time.thread_time() + 0.02
+        while time.thread_time() < until:
+            pass
+
+    in_parts(100, work, least=1)
+    ((seconds, busy),) = noted
+    assert busy > 0.99 * 4 * 0.02
+    assert seconds > 0
 
 
 def test_this_thread_takes_all_where_no_other_begins(monkeypatch):

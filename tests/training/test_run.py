@@ -11,8 +11,10 @@ from tiny_person import tiny_recipe
 
 from twofold.config import with_overrides
 from twofold.errors import TwofoldError
+from twofold.methods import subject as subject_module
 from twofold.methods.factorized_recipes import quick, released
 from twofold.methods.subject import Subject
+from twofold.npz import read_npz
 from twofold.training.row_adam import make_optimizer
 from twofold.training.run import (
     choose_device,
@@ -217,6 +219,32 @@ def test_a_capture_of_somebody_else_is_refused_and_of_another_motion_where_that_
     require_same(run, moved, motion=False)
     with pytest.raises(TwofoldError, match=r"poses differs"):
         require_same(run, moved, motion=True)
+
+
+def test_a_run_opens_where_the_body_is_posed_with_another_rounding(run, person, monkeypatch):
+    """Nodes of feature grids lie within a distance of the canonical body; which ones do depends on where it is."""
+    trained, _ = load(run)
+    plain = subject_module.pose_body
+
+    def otherwise(shaped, pose, translation):
+        body = plain(shaped, pose, translation)
+        return replace(body, canonical_vertices=1.01 * body.canonical_vertices)
+
+    monkeypatch.setattr(subject_module, "pose_body", otherwise)
+    other = RECIPE.method.build(Subject.of(person), RECIPE.seed).state_dict()
+    assert any(other[name].shape != tensor.shape for name, tensor in trained.state_dict().items())
+    again, _ = load(run)
+    torch.testing.assert_close(again.state_dict(), trained.state_dict(), rtol=0, atol=0)
+    require_same(run, person, motion=True)
+
+
+def test_a_run_that_stored_no_canonical_body_poses_its_own(run):
+    arrays = read_npz(run / "subject.npz")
+    trained, _ = load(run)
+    np.savez(run / "subject.npz", **{name: array for name, array in arrays.items() if name != "canonical"})
+    again, _ = load(run)
+    assert again.subject.canonical is None
+    torch.testing.assert_close(again.state_dict(), trained.state_dict(), rtol=0, atol=0)
 
 
 def test_capture_that_has_moved_is_asked_for(run, tmp_path):

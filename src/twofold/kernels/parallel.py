@@ -5,6 +5,7 @@ import inspect
 import itertools
 import sys
 import threading
+import time
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextvars import ContextVar
@@ -141,17 +142,20 @@ def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) 
     parts = min(threads * PARTS_EACH, most)
     bounds = [count * part // parts for part in range(parts + 1)]
     results: list[Result | None] = [None] * parts
-    following = itertools.count()
+    following, busy = itertools.count(), list[float]()
 
     def take() -> None:
-        _INSIDE.part = True
+        _INSIDE.part, begun = True, time.thread_time()
         try:
             while (part := next(following)) < parts:
                 results[part] = work(bounds[part], bounds[part + 1])
         finally:
             _INSIDE.part = False
+            busy.append(time.thread_time() - begun)
 
-    others = [_pool(threads - 1).submit(take) for _ in range(threads - 1)]
+    begun = time.perf_counter()
+    helping = _SHARING.pays()
+    others = [_pool(threads - 1).submit(take) for _ in range(threads - 1)] if helping else []
     try:
         take()
     finally:
@@ -160,7 +164,40 @@ def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) 
     for other in others:
         if not other.cancelled():
             other.result()
+    if helping:
+        _SHARING.note(time.perf_counter() - begun, sum(busy))
     return results  # type: ignore[return-value]
+
+
+@final
+class _Sharing:
+    """Whether other threads shorten the work at present, or only wait for cores that other processes keep busy.
+
+    A thread that is stopped within a part holds up all the others for milliseconds, a dozen times a training step.
+    Parts are the same either way, so results are.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is known yet."""
+        self.ratio, self.alone_until = START, 0.0
+
+    def pays(self) -> bool:
+        """Whether work is to be shared now."""
+        return time.perf_counter() >= self.alone_until
+
+    def note(self, seconds: float, busy: float) -> None:
+        """Takes account of work that took so many seconds, of which the processor was busy in all threads together."""
+        if busy < SHORT:
+            return
+        self.ratio += (seconds / busy - self.ratio) / RECENT
+        if self.ratio > NO_GAIN:
+            self.ratio, self.alone_until = START, time.perf_counter() + REST
+
+
+SHORT, RECENT, START, NO_GAIN, REST = 3e-4, 8, 0.7, 0.95, 2.0
+"""Work that is long enough to judge by, seconds; over about how many works the ratio of time to processor time is
+averaged, from where it starts, above which threads do not pay, and for how many seconds work is then not shared."""
+_SHARING = _Sharing()
 
 
 def ahead(items: Iterable[Item]) -> Generator[Item]:

@@ -62,7 +62,7 @@ class _PickedSsim(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_ssim: Tensor) -> tuple[Tensor, None, None, None, None]:
+    def backward(ctx: Any, by_ssim: Tensor) -> tuple[Tensor, None, None, None, None]:  # type: ignore[override]
         (by_color,) = ctx.saved_tensors
         return by_ssim * by_color, None, None, None, None
 

@@ -62,7 +62,7 @@ class SkinnedAvatar(Avatar[SkinnedPose], Generic[OwnConfig, OwnField]):
         self.config, self.subject = config, subject
         self.refinement = PoseRefinement(subject.times, len(subject.betas), tuple(config.pose.refine))
         given = shape_body(subject.body, subject.betas)
-        canonical = pose_body(given, subject.poses[0], subject.translations[0])
+        canonical = subject.canonical_body()
         self.register_buffer("rest_joints", given.joints.clone(), persistent=False)
         self.field = build_field(canonical, 72 if config.pose.with_root else 69, torch.Generator().manual_seed(seed))
         start = config.beta - config.beta_floor

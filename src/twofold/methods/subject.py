@@ -1,14 +1,14 @@
 """The person that an avatar is made of."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from twofold.body.skeleton import Body, shape_body
+from twofold.body.skeleton import Body, PosedBody, pose_body, shape_body
 from twofold.capture.types import Capture
 from twofold.deform.observability import observed_projection, pose_jacobian
 from twofold.errors import TwofoldError
@@ -26,6 +26,8 @@ class Subject:
         poses: their axis-angle rotations, radians.
         translations: their translations, metres.
         scene_scale: what the authors' release multiplies lengths with (3 / (1.1 times the furthest camera)).
+        canonical: vertices of the canonical body, metres; None in older runs. Feature grids have nodes within a
+            distance of these, and another processor that rounds otherwise would find some more or fewer.
     """
 
     body: Body
@@ -34,6 +36,12 @@ class Subject:
     poses: Float[Tensor, "T 24 3"]
     translations: Float[Tensor, "T 3"]
     scene_scale: float
+    canonical: Float[Tensor, "V 3"] | None = None
+
+    def canonical_body(self) -> PosedBody:
+        """The body of the first training frame beside the canonical one."""
+        posed = pose_body(shape_body(self.body, self.betas), self.poses[0], self.translations[0])
+        return posed if self.canonical is None else replace(posed, canonical_vertices=self.canonical)
 
     @staticmethod
     def of(capture: Capture) -> "Subject":
@@ -42,7 +50,7 @@ class Subject:
         frames = [frames_by_index[time] for time in sorted(frames_by_index)]
         middle = torch.stack([f.translation + capture.body.joints[0] for f in frames]).mean(0)
         away = max(float((f.camera.center - middle).norm()) for f in frames)
-        return Subject(
+        subject = Subject(
             body=capture.body,
             betas=capture.betas,
             times=torch.tensor([f.frame_index for f in frames]),
@@ -50,11 +58,14 @@ class Subject:
             translations=torch.stack([f.translation for f in frames]),
             scene_scale=3 / (1.1 * away),
         )
+        return replace(subject, canonical=subject.canonical_body().canonical_vertices)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """As a run folder stores it."""
         own = {"betas": self.betas, "times": self.times, "poses": self.poses, "translations": self.translations}
         body = {f"body_{name}": array for name, array in self.body.arrays().items()}
+        if self.canonical is not None:
+            own["canonical"] = self.canonical
         return {**{name: t.numpy() for name, t in own.items()}, **body, "scene_scale": np.array(self.scene_scale)}
 
     @staticmethod
@@ -69,7 +80,9 @@ class Subject:
         if missing:
             raise TwofoldError(f"{where} lacks {', '.join(missing)}; it is damaged, train again.")
         body = Body.from_arrays({n[5:]: a for n, a in arrays.items() if n.startswith("body_")}, where)
-        sizes: dict[str | int, int] = {"S": arrays["betas"].size, "T": arrays["times"].size}
+        if "canonical" in arrays:
+            shapes["canonical"] = ("V", 3)
+        sizes: dict[str | int, int] = {"S": arrays["betas"].size, "T": arrays["times"].size, "V": len(body.template)}
         for name, shape in shapes.items():
             array, expected = arrays[name], tuple(sizes.get(axis, axis) for axis in shape)
             if array.shape != expected or array.dtype.kind not in "fiu" or not are_moderate(array):
@@ -84,6 +97,7 @@ class Subject:
             poses=torch.as_tensor(arrays["poses"]).float(),
             translations=torch.as_tensor(arrays["translations"]).float(),
             scene_scale=float(arrays["scene_scale"]),
+            canonical=torch.as_tensor(arrays["canonical"]).float() if "canonical" in arrays else None,
         )
 
 

@@ -122,7 +122,8 @@ class Walk:
         finer = walk_kernels.divide(self.given[0], self.given[1], tuple(a[coarse[0]] for a in self.on_rays), parts)
         walk = replace(self, step=self.step / parts, chosen=finer)
         found, through = walk._mapped(np.arange(len(finer[0])))[:_GOOD], np.ones(len(self.ray_ids), np.float32)
-        seen = walk._follow(*(found[part] for part in _FOLLOWED), query, least, through, None)
+        number, point, away = (found[part] for part in _FOLLOWED)
+        seen = walk._follow(number, point, away, query, least, through, None)
         return walk._placement(*(array[seen] for array in found))
 
     def _seen_by(self, grid: SdfGrid, query: FieldQuery, least: float, share: float, parts: int) -> Placement:

@@ -162,7 +162,7 @@ class _Surface(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_out: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, by_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         *given, beta, weight, optical = ctx.saved_tensors
         sdf, *rest = (tensor.numpy() for tensor in given)
         by_sdf, by_color = torch.empty_like(given[0]), torch.empty_like(given[1])
