@@ -362,7 +362,7 @@ def _mean_over(values: Tensor, weights: Tensor) -> Tensor:
 
 
 def _window(center: float, like: Tensor) -> Tensor:
-    """Weights of a window's pixels, which sum to 1; the bell's middle is so many pixels from the first one."""
+    """Weights of a window's pixels, which sum to 1; the bell's middle is `center` pixels from the first one."""
     offsets = torch.arange(S3IM_WINDOW, dtype=like.dtype, device=like.device) - center
     bell = torch.exp(-offsets.square() / (2 * S3IM_SIGMA**2))
     return bell[:, None] * bell / bell.sum() ** 2

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twofold.body.blending import blend_transforms, has_kernel, skin_vertices
+from twofold.body.blending import blend_transforms, has_kernel, in_pytorch, skin_vertices
 from twofold.body.skeleton import skin
 
 
@@ -85,23 +85,29 @@ def test_strided_tensors_are_taken_as_contiguous_ones():
             assert torch.equal(one, other)
 
 
-def test_loops_are_for_gradients_in_single_precision():
+def test_loops_are_for_single_precision():
     points, _, transforms = draw()
-    learned = transforms.clone().requires_grad_()
-    assert has_kernel(points, learned)
-    assert not has_kernel(points, transforms)
-    assert not has_kernel(points.double(), learned)
-    with torch.no_grad():
-        assert not has_kernel(points, learned)
+    assert has_kernel(points, transforms)
+    assert not has_kernel(points.double(), transforms)
+    with in_pytorch():
+        assert not has_kernel(points, transforms)
+    assert has_kernel(points, transforms)
 
 
-def test_without_a_gradient_results_are_those_of_the_dense_product_to_the_bit():
-    """Stored feature grids lie around the canonical body; see `has_kernel`."""
+def test_a_gradient_changes_no_bit_of_the_result():
+    points, weights, transforms = draw()
+    plain = skin_vertices(points, weights, transforms)
+    assert torch.equal(skin_vertices(points, weights, transforms.clone().requires_grad_()), plain)
+
+
+def test_in_pytorch_results_are_those_of_the_dense_product_to_the_bit():
+    """Feature grids of older runs lie around a canonical body that was posed so."""
     points, weights, transforms = draw()
     dense = (weights @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4))
-    assert torch.equal(blend_transforms(weights, transforms), dense)
-    moved = (dense[:, :, :3] @ points[:, :, None])[..., 0] + dense[:, :, 3]
-    assert torch.equal(skin_vertices(points, weights, transforms), moved)
+    with in_pytorch():
+        assert torch.equal(blend_transforms(weights, transforms), dense)
+        moved = (dense[:, :, :3] @ points[:, :, None])[..., 0] + dense[:, :, 3]
+        assert torch.equal(skin_vertices(points, weights, transforms), moved)
 
 
 def test_weights_that_were_changed_are_looked_at_again():

@@ -1,5 +1,8 @@
 """Transforms blended by skinning weights, of which few are not zero: on CPUs only these are looked at."""
 
+import contextlib
+from collections.abc import Generator
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -11,21 +14,27 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from twofold.body import blending_kernels as kernels
 
+_PLAIN: ContextVar[bool] = ContextVar("_PLAIN", default=False)
 _Entries = tuple[np.ndarray, np.ndarray, np.ndarray]
 _known: "WeakTensorKeyDictionary" = WeakTensorKeyDictionary()
 """The entries of weights that are in use, and which version of these they are of: a body has the same in every step."""
 
 
-def has_kernel(*tensors: Tensor) -> bool:
-    """Whether compiled loops are used: for a gradient in single precision on a CPU, with nothing like `torch.vmap`.
+@contextlib.contextmanager
+def in_pytorch() -> Generator[None]:
+    """While the block lasts, bodies are posed without compiled loops, which round otherwise."""
+    token = _PLAIN.set(True)
+    try:
+        yield
+    finally:
+        _PLAIN.reset(token)
 
-    Without a gradient it stays with PyTorch, to the bit: feature grids are built around a body in the canonical pose,
-    and stored features belong to rows that another rounding would change.
-    """
+
+def has_kernel(*tensors: Tensor) -> bool:
+    """Whether compiled loops are used: in single precision on a CPU, with nothing like `torch.vmap`."""
     if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():  # pyright: ignore[reportPrivateUsage]
         return False
-    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    return wanted and all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
+    return not _PLAIN.get() and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
 
 
 def blend_transforms(weights: Float[Tensor, "n J"], transforms: Float[Tensor, "J 4 4"]) -> Float[Tensor, "n 3 4"]:

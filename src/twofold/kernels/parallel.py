@@ -142,13 +142,16 @@ def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) 
     parts = min(threads * PARTS_EACH, most)
     bounds = [count * part // parts for part in range(parts + 1)]
     results: list[Result | None] = [None] * parts
-    following, busy = itertools.count(), list[float]()
+    following, busy, failed = itertools.count(), list[float](), threading.Event()
 
     def take() -> None:
         _INSIDE.part, begun = True, time.thread_time()
         try:
-            while (part := next(following)) < parts:
+            while not failed.is_set() and (part := next(following)) < parts:
                 results[part] = work(bounds[part], bounds[part + 1])
+        except BaseException:
+            failed.set()
+            raise
         finally:
             _INSIDE.part = False
             busy.append(time.thread_time() - begun)
@@ -159,7 +162,7 @@ def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) 
     try:
         take()
     finally:
-        # Whoever has not begun finds nothing left to do, unless this thread failed.
+        # Whoever has not begun would find nothing left to do.
         wait([other for other in others if not other.cancel()])
     for other in others:
         if not other.cancelled():
@@ -186,7 +189,12 @@ class _Sharing:
         return time.perf_counter() >= self.alone_until
 
     def note(self, seconds: float, busy: float) -> None:
-        """Takes account of work that took so many seconds, of which the processor was busy in all threads together."""
+        """Adds what one call showed.
+
+        Args:
+            seconds: how long it took.
+            busy: for how long processors worked for it, all threads together, seconds.
+        """
         if busy < SHORT:
             return
         self.ratio += (seconds / busy - self.ratio) / RECENT

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from twofold.body.blending import in_pytorch
 from twofold.body.skeleton import Body, PosedBody, pose_body, shape_body
 from twofold.capture.types import Capture
 from twofold.deform.observability import observed_projection, pose_jacobian
@@ -40,7 +41,8 @@ class Subject:
 
     def canonical_body(self) -> PosedBody:
         """The body of the first training frame beside the canonical one."""
-        posed = pose_body(shape_body(self.body, self.betas), self.poses[0], self.translations[0])
+        with in_pytorch():  # As it was where a run has not stored it.
+            posed = pose_body(shape_body(self.body, self.betas), self.poses[0], self.translations[0])
         return posed if self.canonical is None else replace(posed, canonical_vertices=self.canonical)
 
     @staticmethod

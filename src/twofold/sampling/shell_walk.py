@@ -127,7 +127,7 @@ class Walk:
         return walk._placement(*(array[seen] for array in found))
 
     def _seen_by(self, grid: SdfGrid, query: FieldQuery, least: float, share: float, parts: int) -> Placement:
-        """`seen` with a grid, some rays in each thread; steps are divided into so many parts."""
+        """`seen` with a grid, some rays in each thread; steps are divided into `parts`."""
         beta, step = np.float32(query.beta.detach()), self.step / parts
         light = (beta, *(np.float32(number) for number in (least, share, self._guard(query, least))))
         given = (*self.given, grid.arrays(), light, np.float32(self.spacing), parts)

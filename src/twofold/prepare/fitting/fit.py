@@ -6,8 +6,9 @@ smoothly, bend their joints one way only, and have one shape. Where feet of one 
 they stand on one level, and the body keeps its balance (see `footing`, `physics`).
 """
 
+import contextlib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -152,17 +153,26 @@ def _fit(
     def windows(begin: int, end: int) -> None:
         for number in rest[begin:end]:
             some, space = _window(evidence, points_in_space, slice(starts[number], starts[number] + WINDOW + OVERLAP))
-            parts[number] = _fit_window(body, some, fps, False, config, space, known, going_on)
+            with _telling(stopped):
+                parts[number] = _fit_window(body, some, fps, False, config, space, known, going_on)
             with counting:
                 fitted[0] += 1
                 progress(fitted[0] / len(starts))
 
-    try:
+    # Other threads would go on to the end of their windows, whether a part fails or the wait for them.
+    with _telling(stopped):
         in_parts(len(rest), windows, 1)
-    except BaseException:
-        stopped.set()  # Threads would go on to the end of their windows.
-        raise
     return _joined(parts)
+
+
+@contextlib.contextmanager
+def _telling(stopped: threading.Event) -> Generator[None]:
+    """Sets the event where the block fails."""
+    try:
+        yield
+    except BaseException:
+        stopped.set()
+        raise
 
 
 def _window(
