@@ -103,8 +103,57 @@ def test_work_is_not_shared_for_a_while_where_threads_only_wait(sharing, monkeyp
     # Short work says nothing, and one slow work does not decide.
     for _ in range(50):
         sharing.note(1e-3, 1e-5)
-    sharing.note(0.02, 0.01)
+    sharing.note(1.0, 0.01)
     assert sharing.pays()
+
+
+def test_long_work_is_shared_however_busy_the_machine_is(sharing, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    sharing.alone_until = float("inf")
+    both = threading.Barrier(2, timeout=20)
+    in_parts(2, lambda begin, end: both.wait(), least=1, long=True)
+    with pytest.raises(threading.BrokenBarrierError):
+        in_parts(2, lambda begin, end: both.wait(timeout=0.05), least=1)
+
+
+def test_the_first_error_is_raised_and_no_further_part_begins(monkeypatch):
+    """Other threads may fail because they are told that one has."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    both, told, begun = threading.Barrier(2, timeout=20), threading.Event(), []
+
+    def work(begin, end):
+        begun.append(begin)
+        both.wait()
+        if threading.current_thread() is threading.main_thread():
+            assert told.wait(20)
+            time.sleep(0.1)
+            raise InterruptedError("another part failed")
+        told.set()
+        raise ValueError("the fault")
+
+    with pytest.raises(ValueError, match="the fault"):
+        in_parts(100, work, least=1)
+    assert sorted(begun) == [0, 25]
+
+
+def test_threads_that_were_asked_are_waited_for_where_one_cannot_be(monkeypatch):
+    """Else they would write into arrays that their owner has given up."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    pool, asked, done = parallel._pool(2), [], []
+    real = pool.submit
+
+    def submit(take):
+        asked.append(take)
+        if len(asked) == 2:
+            raise RuntimeError("can't start new thread")
+        return real(take)
+
+    monkeypatch.setattr(pool, "submit", submit)
+    with pytest.raises(RuntimeError, match="new thread"):
+        in_parts(100, lambda begin, end: (time.sleep(0.02), done.append(begin)), least=1)
+    before = len(done)
+    time.sleep(0.1)
+    assert len(done) == before < 6
 
 
 def test_parts_of_busy_threads_are_counted_as_work(sharing, monkeypatch):

@@ -1,5 +1,6 @@
 import math
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -195,3 +196,9 @@ def test_normals_are_constants_of_a_composited_surface():
     normals.requires_grad_()
     composite_surface(sdf.requires_grad_(), beta, color, normals, samples, 2).backward(by_out)
     assert normals.grad is None
+
+
+def test_samples_of_rays_that_are_not_there_are_refused():
+    sdf, beta, color, normals, samples, _ = surface_case([2, 3], 2)
+    with pytest.raises(ValueError, match="samples are of 1 rays, the last one is of ray 1"):
+        composite_surface(sdf, beta, color, normals, samples, 1)

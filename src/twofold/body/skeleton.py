@@ -215,7 +215,7 @@ def joint_transforms(
 
     Where `has_kernel` says so it is one compiled loop, differentiable once.
     """
-    if has_kernel(joints, pose, translation):
+    if has_kernel(joints, pose, translation) and pose.shape[:-2] == translation.shape[:-1]:
         return _Kinematics.apply(joints, pose, translation)  # type: ignore[return-value]
     return joint_transforms_of_rotations(joints, axis_angle_to_matrix(pose), translation)
 
@@ -224,7 +224,7 @@ def joint_transforms_of_rotations(
     joints: Float[Tensor, "24 3"], rotations: Float[Tensor, "*b 24 3 3"], translation: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 24 4 4"]:
     """`joint_transforms` of a pose given as rotation matrices, root first."""
-    if has_kernel(joints, rotations, translation):
+    if has_kernel(joints, rotations, translation) and rotations.shape[:-3] == translation.shape[:-1]:
         return _Kinematics.apply(joints, rotations, translation)  # type: ignore[return-value]
     rest = joints.unbind()
     above = torch.stack([rest[parent] for parent in PARENTS[1:]])

@@ -1,4 +1,4 @@
-"""Compiled loops on several threads: the range is cut into as many parts as PyTorch uses threads."""
+"""Compiled loops on as many threads as PyTorch uses: the range is cut into parts that threads take one by one."""
 
 import contextlib
 import inspect
@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextvars import ContextVar
 from functools import lru_cache
 from pathlib import Path
@@ -20,8 +20,8 @@ from numba.core.caching import FunctionCache
 _PACKAGE = Path(__file__).parents[1]
 Result = TypeVar("Result")
 Item = TypeVar("Item")
-_PARTS: ContextVar[int | None] = ContextVar("_PARTS", default=None)
-"""How many parts ranges are cut into, where it is not PyTorch's number of threads."""
+_THREADS: ContextVar[int | None] = ContextVar("_THREADS", default=None)
+"""How many threads share a range, where it is not PyTorch's number of threads."""
 PARTS_EACH = 2
 """Parts for each thread: more even out better and cost more calls."""
 _INSIDE = threading.local()
@@ -100,19 +100,19 @@ def one_thread_each() -> Generator[None]:
     For thousands of small operations: sharing each of them out costs more than it saves.
     """
     threads = torch.get_num_threads()
-    token = _PARTS.set(_parts())
+    token = _THREADS.set(_threads())
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(threads)
-        _PARTS.reset(token)
+        _THREADS.reset(token)
 
 
-def _parts() -> int:
+def _threads() -> int:
     if getattr(_INSIDE, "part", False):
         return 1
-    return _PARTS.get() or torch.get_num_threads()
+    return _THREADS.get() or torch.get_num_threads()
 
 
 @lru_cache(maxsize=4)
@@ -120,54 +120,60 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="twofold")
 
 
-def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024) -> list[Result]:
+def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024, *, long: bool = False) -> list[Result]:
     """Calls `work(begin, end)` on parts of 0..count, side by side; `work` must let go of the interpreter's lock.
 
     There are more parts than threads, and each thread takes the next part when it is done with one: parts of unequal
     work, or a core that another process uses, keep nobody waiting for long. This thread takes parts like the others.
     Which thread takes a part changes nothing, so what is summed over the parts in order repeats to the bit.
 
+    Where a part fails no further parts are begun; those that others have begun are waited for, and the first error is
+    raised.
+
     Args:
         count: size of the whole range.
         work: handles one part; parts must not write to the same memory.
         least: parts smaller than this are not worth a thread.
+        long: whether parts take seconds, or wait for files: they are then shared however busy other processes are.
 
     Returns:
         what `work` gave for each part, in order.
     """
     most = max(1, count // max(least, 1))
-    threads = min(_parts(), most)
+    threads = min(_threads(), most)
     if threads == 1:
         return [work(0, count)]
     parts = min(threads * PARTS_EACH, most)
     bounds = [count * part // parts for part in range(parts + 1)]
     results: list[Result | None] = [None] * parts
-    following, busy, failed = itertools.count(), list[float](), threading.Event()
+    following, busy, errors = itertools.count(), list[float](), list[BaseException]()
 
     def take() -> None:
         _INSIDE.part, begun = True, time.thread_time()
         try:
-            while not failed.is_set() and (part := next(following)) < parts:
+            while not errors and (part := next(following)) < parts:
                 results[part] = work(bounds[part], bounds[part + 1])
-        except BaseException:
-            failed.set()
-            raise
+        except BaseException as error:
+            errors.append(error)
         finally:
             _INSIDE.part = False
             busy.append(time.thread_time() - begun)
 
-    begun = time.perf_counter()
-    helping = _SHARING.pays()
-    others = [_pool(threads - 1).submit(take) for _ in range(threads - 1)] if helping else []
+    begun, helping = time.perf_counter(), long or _SHARING.pays()
+    others: list[Future[None]] = []
     try:
+        if helping:
+            others += [_pool(threads - 1).submit(take) for _ in range(threads - 1)]
         take()
+    except BaseException as error:  # An interrupt between two parts, or no room for a thread.
+        errors.append(error)
+        raise
     finally:
         # Whoever has not begun would find nothing left to do.
         wait([other for other in others if not other.cancel()])
-    for other in others:
-        if not other.cancelled():
-            other.result()
-    if helping:
+    if errors:
+        raise errors[0]
+    if helping and not long:
         _SHARING.note(time.perf_counter() - begun, sum(busy))
     return results  # type: ignore[return-value]
 
@@ -197,7 +203,8 @@ class _Sharing:
         """
         if busy < SHORT:
             return
-        self.ratio += (seconds / busy - self.ratio) / RECENT
+        # Of a work that was held up once it counts that sharing gained nothing, not for how long it was held up.
+        self.ratio += (min(seconds / busy, 1.0) - self.ratio) / RECENT
         if self.ratio > NO_GAIN:
             self.ratio, self.alone_until = START, time.perf_counter() + REST
 

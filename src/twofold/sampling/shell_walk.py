@@ -12,7 +12,7 @@ from torch import Tensor
 
 from twofold.geometry.cameras import Rays
 from twofold.kernels.lanes import LANES
-from twofold.kernels.parallel import in_parts
+from twofold.kernels.parallel import in_parts, one_thread_each
 from twofold.sampling import search_kernels, visibility_kernels, walk_kernels
 from twofold.sampling.placement import Deformation, FieldQuery, Placement
 from twofold.sampling.sdf_grid import SdfGrid
@@ -136,11 +136,13 @@ class Walk:
             found = search_kernels.choose(*given, begin, end)
             if query.costly:
                 return found
-            with torch.no_grad():  # Which is a setting of each thread.
+            torch.set_num_threads(1)  # Of each thread, and so is the next.
+            with torch.no_grad():
                 sdf = query.distance(torch.from_numpy(found[_POINT])).float().contiguous().numpy()
             return search_kernels.keep_seen(sdf, beta, np.float32(least), np.float32(step), *found)
 
-        found = _joined(in_parts(len(self.ray_ids), seen, least=_FEW_RAYS))
+        with one_thread_each():
+            found = _joined(in_parts(len(self.ray_ids), seen, least=_FEW_RAYS))
         return replace(self, step=step)._placed(*found)
 
     def _search(self, query: FieldQuery, least: float, share: float) -> list[np.ndarray]:

@@ -48,28 +48,12 @@ def composite_weights(density: Float[Tensor, "S"], samples: Samples) -> Float[Te
         samples: packed.
     """
     optical = density * samples.delta
-    if optical.dtype == torch.float32 and not optical.is_cuda:
-        return _Weights.apply(optical, samples.ray_index)  # type: ignore[return-value]
-    return torch.exp(-optical_depth(optical, samples)) * -torch.expm1(-optical)
-
-
-class _Weights(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, optical: Tensor, ray_index: Tensor) -> Tensor:  # type: ignore[override]
-        optical, ray_index = optical.detach().contiguous(), ray_index.contiguous()
-        out = torch.empty_like(optical)
-        kernels.weights(optical.numpy(), ray_index.numpy(), out.numpy())
-        ctx.save_for_backward(optical, ray_index, out)
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, by_weight: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        optical, ray_index, out = ctx.saved_tensors
-        by_optical = torch.empty_like(optical)
-        given = (optical, ray_index, out, by_weight.contiguous(), by_optical)
-        kernels.weights_backward(*(tensor.detach().numpy() for tensor in given))
-        return by_optical, None
+    wanted = torch.is_grad_enabled() and optical.requires_grad
+    if wanted or optical.is_cuda or optical.dtype != torch.float32:
+        return torch.exp(-optical_depth(optical, samples)) * -torch.expm1(-optical)
+    out = torch.empty_like(optical)
+    kernels.weights(optical.contiguous().numpy(), samples.ray_index.contiguous().numpy(), out.numpy())
+    return out
 
 
 def optical_depth(optical: Float[Tensor, "S"], samples: Samples) -> Float[Tensor, "S"]:
@@ -140,6 +124,8 @@ def composite_surface(
     """
     normals = normals.detach()
     if sdf.dtype == torch.float32 and not sdf.is_cuda:
+        if len(samples) and int(samples.ray_index[-1]) >= rays:
+            raise ValueError(f"samples are of {rays} rays, the last one is of ray {int(samples.ray_index[-1])}")
         given = samples.depth, samples.delta, samples.ray_index, rays
         return _Surface.apply(sdf, beta, color, normals, *given)  # type: ignore[return-value]
     weights = composite_weights(laplace_density(sdf, beta), samples)

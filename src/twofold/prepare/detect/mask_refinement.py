@@ -63,7 +63,7 @@ def background_plate(
     images: Sequence[UInt8[np.ndarray, "h w 3"]], masks: Sequence[UInt8[np.ndarray, "h w"]]
 ) -> BackgroundPlate:
     """The background of a still camera from images and the person's masks in them (0..255)."""
-    near = in_parts(len(masks), lambda begin, end: [_near(mask) for mask in masks[begin:end]], 4)
+    near = in_parts(len(masks), lambda begin, end: [_near(mask) for mask in masks[begin:end]], 4, long=True)
     hidden = np.stack([one for part in near for one in part])
     known = (~hidden).sum(0) >= MIN_SEEN
     color = np.zeros((*known.shape, 3), np.float32)
@@ -77,7 +77,7 @@ def background_plate(
             middle = _median(seen)
             color[rows], deviation[rows] = middle, 1.48 * _median(np.abs(seen - middle)).mean(-1)
 
-    in_parts(-(-len(known) // _STRIP), strips, 1)
+    in_parts(-(-len(known) // _STRIP), strips, 1, long=True)
     return BackgroundPlate(color, deviation, known)
 
 
@@ -204,7 +204,9 @@ def refine_clip(
     some = spread(range(len(images)), PLATE_IMAGES)
     pixels, found = [read_rgb(images[i]) for i in some], [read_grey(masks[i]) for i in some]
     first = background_plate(pixels, found)
-    begun = in_parts(len(some), lambda a, b: [refined_mask(pixels[i], found[i], first) for i in range(a, b)], 4)
+    begun = in_parts(
+        len(some), lambda a, b: [refined_mask(pixels[i], found[i], first) for i in range(a, b)], 4, long=True
+    )
     plate = background_plate(pixels, [mask for part in begun for mask in part])
     del pixels, found
     progress(0.2)
@@ -223,7 +225,7 @@ def refine_clip(
                 counts.append((int(((mask > 127) != (better > 127)).sum()), int((mask > 127).sum())))
             return counts
 
-        for part in in_parts(len(batch), one, 4):
+        for part in in_parts(len(batch), one, 4, long=True):
             for moved, area in part:
                 changed, total = changed + moved, total + area
         progress(0.2 + 0.8 * (batch[-1] + 1) / len(images))

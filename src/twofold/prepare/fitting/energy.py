@@ -207,7 +207,7 @@ def match_rims(
                 found[t] = rim[torch.from_numpy(index)]
                 weight[t] = torch.from_numpy(away < 1.5 * scale).float()
 
-        in_parts(len(found), match, 8)
+        in_parts(len(found), match, 8, long=True)
         weight = weight * (outlines.normals.norm(dim=-1) > 0.5)
     return choose(body, searched.index[found]), weight
 

@@ -151,17 +151,17 @@ def _fit(
             raise InterruptedError("another window failed or the user stopped")
 
     def windows(begin: int, end: int) -> None:
-        for number in rest[begin:end]:
-            some, space = _window(evidence, points_in_space, slice(starts[number], starts[number] + WINDOW + OVERLAP))
-            with _telling(stopped):
+        with _telling(stopped):  # Other threads would go on to the end of their windows.
+            for number in rest[begin:end]:
+                times = slice(starts[number], starts[number] + WINDOW + OVERLAP)
+                some, space = _window(evidence, points_in_space, times)
                 parts[number] = _fit_window(body, some, fps, False, config, space, known, going_on)
-            with counting:
-                fitted[0] += 1
-                progress(fitted[0] / len(starts))
+                with counting:
+                    fitted[0] += 1
+                    progress(fitted[0] / len(starts))
 
-    # Other threads would go on to the end of their windows, whether a part fails or the wait for them.
     with _telling(stopped):
-        in_parts(len(rest), windows, 1)
+        in_parts(len(rest), windows, 1, long=True)
     return _joined(parts)
 
 
