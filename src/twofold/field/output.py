@@ -40,10 +40,8 @@ class FieldOutput:
         if self.gradient is None:
             raise ValueError("normals need the gradient of the distance; this field gave none")
         wanted = torch.is_grad_enabled() and (self.gradient.requires_grad or to_observation.requires_grad)
-        plain = self.gradient.dtype == to_observation.dtype == torch.float32 and len(to_observation) == len(
-            self.gradient
-        )
-        if wanted or self.gradient.is_cuda or not plain:
+        single = self.gradient.dtype == to_observation.dtype == torch.float32
+        if wanted or self.gradient.is_cuda or not single or len(to_observation) != len(self.gradient):
             return F.normalize((to_observation * self.gradient[:, None]).sum(-1), dim=-1, eps=_LEAST)
         out = torch.empty_like(self.gradient, memory_format=torch.contiguous_format)
         turn, gradient = (t.detach().contiguous().numpy() for t in (to_observation, self.gradient))

@@ -78,9 +78,7 @@ def open_mask(mask: Mask) -> UInt8[np.ndarray, "h w"]:
 
 def trace_outlines(masks: Sequence[Mask]) -> Outlines:
     """Outlines of the masks of a clip."""
-    parts = in_parts(
-        len(masks), lambda begin, end: [_trace(open_mask(mask)) for mask in masks[begin:end]], 8, long=True
-    )
+    parts = in_parts(len(masks), lambda a, b: [_trace(open_mask(mask)) for mask in masks[a:b]], 8, long=True)
     traced = [one for part in parts for one in part]
     outside, corner, cell, points, normals, longer = (
         torch.from_numpy(np.stack(part)).float() for part in zip(*traced, strict=True)
