@@ -209,7 +209,7 @@ class _Sharing:
             self.ratio, self.alone_until = START, time.perf_counter() + REST
 
 
-SHORT, RECENT, START, NO_GAIN, REST = 3e-4, 8, 0.7, 0.95, 2.0
+SHORT, RECENT, START, NO_GAIN, REST = 1.5e-3, 8, 0.7, 0.95, 2.0
 """Work that is long enough to judge by, seconds; over about how many works the ratio of time to processor time is
 averaged, from where it starts, above which threads do not pay, and for how many seconds work is then not shared."""
 _SHARING = _Sharing()
