@@ -93,10 +93,11 @@ class TrainingConfig:
         require_within(
             self, steps=(1, most), images_per_step=(1, 1000), checkpoint_every=(1, most), preview_every=(0, most),
             warmup=(0, most), milestones=(0, most), decay=(1e-9, 1), decay_from=(0, 1), clip=(0, 1e6),
-            adam_epsilon=(0, 1),
+            adam_epsilon=(1e-30, 1),
         )  # fmt: skip
-        if not all(0 <= beta < 1 for beta in self.adam_betas):
-            raise ValueError(f"adam_betas={self.adam_betas} should lie in 0..1, below 1")
+        # Steps are divided by the root plus epsilon; and means that keep nothing leave nothing to tell noise by.
+        if not all(0 < beta < 1 for beta in self.adam_betas):
+            raise ValueError(f"adam_betas={self.adam_betas} should lie between 0 and 1 and be neither")
 
     def scaled(self, factor: float) -> "TrainingConfig":
         """The same schedule stretched by a factor. Checkpoints and previews come as often as before."""

@@ -273,7 +273,8 @@ def test_automatic_device_is_the_gpu_where_there_is_one():
     "setting",
     [
         "training.steps=0", "training.images_per_step=0", "method.rates.low=-1", "training.checkpoint_every=0",
-        "training.preview_every=-1", "training.adam_betas=0.9,1.0", "training.clip=-1", "training.steps=many",
+        "training.preview_every=-1", "training.adam_betas=0.9,1.0", "training.adam_betas=0,0.9",
+        "training.adam_epsilon=0", "training.clip=-1", "training.steps=many",
         "method.sampler.refined=1", "method.neighbours=0", "method.beta=0", "method.losses.mask=-0.1",
         "method.shell_refresh=0", "training.steps=1e99", "training.pixels.rays=-1",
         "training.pixels.rays=99999999999", "training.pixels.subject_share=3", "training.pixels.patches=-1",
