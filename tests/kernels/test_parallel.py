@@ -98,7 +98,7 @@ def test_work_is_not_shared_for_a_while_where_threads_only_wait(sharing, monkeyp
     ranges = in_parts(100, lambda begin, end: (begin, end, threading.get_ident()), least=1)
     assert [part[:2] for part in ranges] == [(0, 25), (25, 50), (50, 75), (75, 100)]
     assert {part[2] for part in ranges} == {threading.get_ident()}
-    now[0] += parallel.REST
+    now[0] += parallel.PAUSE
     assert sharing.pays()
     # Short work says nothing, and one slow work does not decide.
     for _ in range(50):

@@ -53,6 +53,11 @@ def blend_transforms(weights: Float[Tensor, "n J"], transforms: Float[Tensor, "J
     """
     if has_kernel(weights, transforms) and not weights.requires_grad:
         return _Blend.apply(weights, transforms)  # type: ignore[return-value]
+    return weighted_transforms(weights, transforms)
+
+
+def weighted_transforms(weights: Float[Tensor, "*b J"], transforms: Float[Tensor, "J 4 4"]) -> Float[Tensor, "*b 3 4"]:
+    """What `blend_transforms` gives, as one product in PyTorch for any device, precision and number of derivatives."""
     return (weights @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4))
 
 
@@ -65,9 +70,9 @@ def skin_vertices(
     return move_points(points, blend_transforms(weights, transforms))
 
 
-def move_points(points: Float[Tensor, "n 3"], transforms: Float[Tensor, "n 3 4"]) -> Float[Tensor, "n 3"]:
+def move_points(points: Float[Tensor, "*b 3"], transforms: Float[Tensor, "*b 3 4"]) -> Float[Tensor, "*b 3"]:
     """Each point moved by the transform of which it has the upper rows."""
-    return (transforms[:, :, :3] @ points[:, :, None])[..., 0] + transforms[:, :, 3]
+    return (transforms[..., :3] @ points[..., None])[..., 0] + transforms[..., 3]
 
 
 def _entries(weights: Tensor) -> _Entries:

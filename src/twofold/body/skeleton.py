@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from twofold.body import kinematics_kernels as kernels
-from twofold.body.blending import has_kernel, move_points, skin_vertices
+from twofold.body.blending import has_kernel, move_points, skin_vertices, weighted_transforms
 from twofold.errors import TwofoldError
 from twofold.geometry.rotations import axis_angle_to_matrix, rigid_inverse, rigid_transform
 from twofold.npz import are_moderate
@@ -287,7 +287,7 @@ def skin(
     points: Float[Tensor, "n 3"], weights: Float[Tensor, "n J"], transforms: Float[Tensor, "J 4 4"]
 ) -> Float[Tensor, "n 3"]:
     """Linear blend skinning: each point moved by the weighted mean of the transforms."""
-    return move_points(points, (weights @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4)))
+    return move_points(points, weighted_transforms(weights, transforms))
 
 
 def pose_body(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from twofold.body.blending import blend_transforms
+from twofold.body.blending import blend_transforms, move_points, weighted_transforms
 from twofold.body.skeleton import PosedBody
 from twofold.deform import skinning_kernels as kernels
 from twofold.kernels.parallel import in_parts
@@ -30,9 +30,7 @@ def inverse_skinning(
         weights: skinning weights of each point, rows sum to 1.
         bones: canonical-to-posed transform of each joint.
     """
-    rows = (weights @ bones[:, :3].flatten(1)).unflatten(-1, (3, 4))
-    inverse = invert_affine(rows)
-    return (inverse[..., :3] @ x_posed[..., None])[..., 0] + inverse[..., 3]
+    return move_points(x_posed, invert_affine(weighted_transforms(weights, bones)))
 
 
 def invert_affine(rows: Float[Tensor, "*b 3 4"]) -> Float[Tensor, "*b 3 4"]:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from twofold.body.blending import weighted_transforms
 from twofold.body.skeleton import PARENTS
 from twofold.deform import weight_volume_kernels as kernels
 from twofold.kernels.mlp import dense_layer, uniform, xavier_bound
@@ -369,5 +370,5 @@ class _BoneLookup(torch.autograd.Function):
 
 
 def _moved(blended: Tensor, transforms: Tensor, points: Tensor) -> Tensor:
-    rows = (blended @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4))
+    rows = weighted_transforms(blended, transforms)
     return (rows[..., :3] * points[:, None]).sum(-1) + rows[..., 3]

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from twofold.body.blending import move_points, weighted_transforms
 from twofold.body.skeleton import JOINT_NAMES
 from twofold.errors import TwofoldError
 from twofold.field.bone_boxes import RIGID_PARTS, TWO_HOPS, assign_to_boxes, bone_frames
@@ -240,8 +241,7 @@ class PointDeformation(nn.Module):
         """
         transforms = posed[list(RIGID_PARTS)]
         weights = (cloud.logits + self.blending(cloud.positions) + self.mask).softmax(-1)
-        rows = (weights @ transforms[:, :3].flatten(1)).unflatten(-1, (3, 4))
-        skinned = (rows[..., :3] @ cloud.rest_points()[..., None])[..., 0] + rows[..., 3]
+        skinned = move_points(cloud.rest_points(), weighted_transforms(weights, transforms))
         # A vector of a part's frame is turned to the world by the frame's rest rotation undone, then the bone's.
         turns = transforms[:, :3, :3] @ cloud.rotations.transpose(-1, -2)
         pose_features, offsets = self._offsets(cloud.positions, features)

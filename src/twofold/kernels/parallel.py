@@ -169,7 +169,7 @@ def in_parts(count: int, work: Callable[[int, int], Result], least: int = 1024, 
         errors.append(error)
         raise
     finally:
-        # Whoever has not begun would find nothing left to do.
+        # Threads that have not begun would find nothing left to do.
         wait([other for other in others if not other.cancel()])
     if errors:
         raise errors[0]
@@ -206,10 +206,10 @@ class _Sharing:
         # Of a work that was held up once it counts that sharing gained nothing, not for how long it was held up.
         self.ratio += (min(seconds / busy, 1.0) - self.ratio) / RECENT
         if self.ratio > NO_GAIN:
-            self.ratio, self.alone_until = START, time.perf_counter() + REST
+            self.ratio, self.alone_until = START, time.perf_counter() + PAUSE
 
 
-SHORT, RECENT, START, NO_GAIN, REST = 1.5e-3, 8, 0.7, 0.95, 2.0
+SHORT, RECENT, START, NO_GAIN, PAUSE = 1.5e-3, 8, 0.7, 0.95, 2.0
 """Work that is long enough to judge by, seconds; over about how many works the ratio of time to processor time is
 averaged, from where it starts, above which threads do not pay, and for how many seconds work is then not shared."""
 _SHARING = _Sharing()

@@ -26,22 +26,12 @@ _KNOWN, _NOWHERE = np.float32(KNOWN_BELOW), np.float32(UNKNOWN)
 
 
 @compiled
-def choose(  # noqa: ANN201
-    shell, rays, canonical, limit, slack, smooth, scale, forward, k, grid, light, spacing, parts, begin, end  # noqa: ANN001
-):  # fmt: skip
+def choose(walk, grid, light, spacing, parts, begin, end):  # noqa: ANN001, ANN201
     """The samples of rays begin..end that may add more than a little by what a grid knows.
 
     Args:
-        shell: of this and all others but two see `search`.
-        rays: see above.
-        canonical: see above.
-        limit: see above.
-        slack: see above.
-        smooth: see above.
-        scale: see above.
-        forward: see above.
-        k: see above.
-        grid: see above.
+        walk: what `map_candidates` takes before the candidates, as one tuple.
+        grid: of this and the next two see `search`.
         light: see above.
         spacing: see above.
         parts: into how many the step of each candidate is divided.
@@ -51,15 +41,13 @@ def choose(  # noqa: ANN201
     Returns:
         ray, depth, k nearest vertices and their weights, canonical point and inverse transform [S 12] of each sample.
     """
-    found = search(
-        shell, rays, canonical, limit, slack, smooth, scale, forward, k, grid, light, spacing, begin, end
-    )  # fmt: skip
+    shell, rays = walk[0], walk[1]
+    found = search(*walk, grid, light, spacing, begin, end)
     if parts > 1:
         found = divide(shell, rays, found, parts)
     ray_at, depth_at = found[0], found[1]
-    number, vertex, weight, point, inverse, _, _, _ = map_candidates(
-        shell, rays, canonical, limit, slack, smooth, scale, forward, k, found, np.arange(len(ray_at)), 0, len(ray_at)
-    )
+    index = np.arange(len(ray_at))
+    number, vertex, weight, point, inverse, _, _, _ = map_candidates(*walk, found, index, 0, len(index))
     possible = np.empty(len(number), np.bool_)
     mark_possible(number, ray_at, point, grid, light[0], light[1], np.float32(rays[5] / parts), possible)
     return _those(possible, ray_at[number], depth_at[number], vertex, weight, point, inverse)

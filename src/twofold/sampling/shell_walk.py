@@ -130,7 +130,7 @@ class Walk:
         """`seen` with a grid, some rays in each thread; steps are divided into `parts`."""
         beta, step = np.float32(query.beta.detach()), self.step / parts
         light = (beta, *(np.float32(number) for number in (least, share, self._guard(query, least))))
-        given = (*self.given, grid.arrays(), light, np.float32(self.spacing), parts)
+        given = (self.given, grid.arrays(), light, np.float32(self.spacing), parts)
 
         def seen(begin: int, end: int) -> tuple[np.ndarray, ...]:
             found = search_kernels.choose(*given, begin, end)

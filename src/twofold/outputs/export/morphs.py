@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import lsq_linear, nnls
 from torch import Tensor
 
+from twofold.body.blending import weighted_transforms
 from twofold.body.skeleton import PosedBody
 from twofold.geometry.rotations import rigid_inverse
 from twofold.geometry.surfaces import vertex_normals
@@ -65,7 +66,7 @@ class Skin:
     def transforms(self, body: PosedBody) -> Float[Tensor, "V 3 4"]:
         """Rest pose to world, at each vertex, with the body in another pose."""
         from_rest = body.bones @ rigid_inverse(self.rest.bones)
-        return (self.weights @ from_rest[:, :3].flatten(1)).unflatten(-1, (3, 4))
+        return weighted_transforms(self.weights, from_rest)
 
     def moved(self, rows: Float[Tensor, "V 3 4"]) -> Float[Tensor, "V 3"]:
         """The vertices of the rest pose, each moved by its own transform."""
